@@ -1,0 +1,283 @@
+"""The avatar: what a fit returns. A pose in, surfels or a picture out; one safetensors file on disk."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from mass_engine.camera import Camera
+from mass_engine.errors import BadArgumentError, EngineError
+from mass_engine.fitting.subject import (
+    Appearance,
+    PosedSurfels,
+    Shape,
+    pose_surfels,
+    render_row,
+    surfel_colors,
+    vertex_normals,
+)
+from mass_engine.hand.model import HandModel
+from mass_engine.hand.pose import HandPose, Side
+from mass_engine.hand.poses import POSE_NAMES, parse_pose
+from mass_engine.raster import RasterOptions, RenderOutput
+from mass_engine.surfel.binding import MeshBinding
+from mass_engine.surfel.cloud import SurfelCloud
+from mass_engine.surfel.harmonics import rgb_to_sh0
+from mass_engine.viewpoint import parse_camera
+
+FILE_NAME = "avatar.safetensors"
+_FORMAT = "1"
+
+
+@dataclass(frozen=True)
+class SourceFrames:
+    """The clip's own poses: ``indices`` [F] of the frames, ``heldout`` [F], ``pose`` batched [F]."""
+
+    indices: Tensor
+    heldout: Tensor
+    pose: HandPose
+
+    def pose_of(self, index: int) -> HandPose:
+        """The pose of the frame ``index``. Raises BadArgumentError ``pose.no_such_frame``."""
+        rows = (self.indices == index).nonzero()
+        if len(rows) == 0:
+            raise BadArgumentError(
+                "pose.no_such_frame",
+                f"Frame {index} has no fitted hand.",
+                f"Use a frame from {int(self.indices.min())} to {int(self.indices.max())} in which the hand was tracked.",
+            )
+        return row_pose(self.pose, int(rows[0]))
+
+
+def row_pose(pose: HandPose, row: int) -> HandPose:
+    """One row of a batched pose, as a batch of one."""
+    only = slice(row, row + 1)
+    return HandPose(
+        pose.betas[only], pose.global_orient[only], pose.hand_pose[only], pose.transl[only], pose.side
+    )
+
+
+@dataclass
+class Avatar:
+    """A posable hand of surfels. ``kept`` [M] are the surfels of ``binding`` that the fit kept."""
+
+    shape: Shape
+    binding: MeshBinding
+    kept: Tensor
+    appearance: Appearance  # of the kept surfels
+    camera: Camera  # the fitted camera, whole picture
+    frames: SourceFrames
+    best_frame: int  # where the hand is seen best: its orientation serves the named poses
+
+    def posed(self, pose: HandPose) -> PosedSurfels:
+        """Kept surfels of a batch of poses [B]."""
+        with torch.no_grad():
+            all_surfels = pose_surfels(self.shape, self.binding, pose)
+            return PosedSurfels(
+                all_surfels.means[:, self.kept],
+                all_surfels.scales[:, self.kept],
+                all_surfels.quats[:, self.kept],
+                all_surfels.normals[:, self.kept],
+                all_surfels.bone_rotations,
+                all_surfels.joints,
+            )
+
+    def render_pose(
+        self, pose: HandPose, camera: Camera, options: RasterOptions | None = None
+    ) -> RenderOutput:
+        """Rasterise one pose (a batch of one) over black."""
+        with torch.no_grad():
+            return render_row(
+                self.appearance,
+                self.posed(pose),
+                0,
+                self.binding.bones[self.kept],
+                camera,
+                options or RasterOptions(),
+            )
+
+    def resolve_pose(self, spec: str) -> HandPose:
+        """``frame:N``, a named pose or 48 numbers -> a placed pose with this hand's shape (batch of one).
+
+        A named pose takes the orientation of the frame that shows the hand best; what is not a frame
+        stands on the camera's axis at that frame's distance.
+        """
+        text = spec.strip()
+        if text.startswith("frame:"):
+            number = text.removeprefix("frame:")
+            if not (number.isascii() and number.isdigit() and len(number) < 10):
+                raise BadArgumentError("pose.invalid", f"{spec[:40]!r} names no frame.", "Use frame:12, say.")
+            return self.frames.pose_of(int(number))
+        best = self.frames.pose_of(self.best_frame)
+        parsed = parse_pose(text, self.shape.model.side)
+        orient = best.global_orient if text in POSE_NAMES else parsed.global_orient.reshape(1, 3)
+        pose = HandPose(
+            self.shape.betas.reshape(1, 10),
+            orient,
+            parsed.hand_pose.reshape(1, 45),
+            torch.zeros(1, 3),
+            parsed.side,
+        )
+        center, _ = self._bounds(pose)
+        target = self.camera_point(float(best.transl[0, 2]))
+        return HandPose(pose.betas, pose.global_orient, pose.hand_pose, (target - center)[None], pose.side)
+
+    def camera_point(self, depth: float) -> Tensor:
+        """The world point [3] on the fitted camera's axis at ``depth`` metres."""
+        rotation, shift = self.camera.world_to_camera[:3, :3], self.camera.world_to_camera[:3, 3]
+        return rotation.T @ (torch.tensor([0.0, 0.0, max(depth, 0.1)]) - shift)
+
+    def _bounds(self, pose: HandPose) -> tuple[Tensor, float]:
+        """Centre [3] and radius of a sphere around the posed hand."""
+        with torch.no_grad():
+            vertices = self.shape.model.posed(pose, self.shape.offsets()).vertices[0]
+        center = (vertices.amax(0) + vertices.amin(0)) / 2
+        return center, float((vertices - center).norm(dim=-1).max())
+
+    def render(
+        self, pose_spec: str, camera_spec: str = "orbit:0,0", width: int = 512, height: int = 512
+    ) -> NDArray[np.uint8]:
+        """A picture uint8 [H,W,4], straight-alpha RGBA. Raises BadArgumentError for a bad specification."""
+        if not (1 <= width <= 16384 and 1 <= height <= 16384):
+            raise BadArgumentError("size.invalid", f"{width}x{height} is not a picture.", "Use 1 to 16384.")
+        pose = self.resolve_pose(pose_spec)
+        center, radius = self._bounds(pose)
+        camera = parse_camera(camera_spec, self.camera, width, height, center, radius)
+        return straight_rgba(self.render_pose(pose, camera))
+
+    def cloud(self, pose_spec: str = "rest") -> SurfelCloud:
+        """The surfels in a pose, shaded as in the clip; hand at the origin for poses that are no frame.
+
+        In the rest pose the view-dependent harmonics come along (a bone's frame is the world's there).
+        """
+        pose = self.resolve_pose(pose_spec)
+        if pose_spec.strip() == "rest":
+            rest = HandPose.rest(self.shape.model.side)
+            pose = HandPose(pose.betas, rest.global_orient[None], rest.hand_pose[None], rest.transl[None], rest.side)
+        surfels = self.posed(pose)
+        plain = Appearance(
+            self.appearance.albedo,
+            self.appearance.opacity_logits,
+            self.appearance.sh[:, :0],
+            self.appearance.light,
+        )
+        colors = surfel_colors(plain, surfels, 0, self.binding.bones[self.kept], self.camera)
+        sh = rgb_to_sh0(colors).unsqueeze(1)
+        if pose_spec.strip() == "rest":
+            sh = torch.cat([sh, self.appearance.sh], 1)
+        return SurfelCloud(
+            surfels.means[0],
+            surfels.scales[0],
+            surfels.quats[0],
+            torch.sigmoid(self.appearance.opacity_logits),
+            sh,
+            self.binding.surfel_faces[self.kept],
+        )
+
+    def save(self, path: Path) -> None:
+        """Write the avatar to a file, or into a run directory, in one step."""
+        target = path / FILE_NAME if path.is_dir() else path
+        model, pose = self.shape.model, self.frames.pose
+        tensors = {
+            "shape.betas": self.shape.betas,
+            "shape.displacement": self.shape.displacement,
+            "kept": self.kept,
+            "albedo": self.appearance.albedo,
+            "opacity_logits": self.appearance.opacity_logits,
+            "sh": self.appearance.sh,
+            "light": self.appearance.light,
+            "camera.K": self.camera.K,
+            "camera.world_to_camera": self.camera.world_to_camera,
+            "frames.indices": self.frames.indices,
+            "frames.heldout": self.frames.heldout,
+            "frames.betas": pose.betas,
+            "frames.global_orient": pose.global_orient,
+            "frames.hand_pose": pose.hand_pose,
+            "frames.transl": pose.transl,
+            **{f"model.{name}": value for name, value in model.tensors().items()},
+        }
+        metadata = {
+            "format": _FORMAT,
+            "side": model.side,
+            "levels": str(self.binding.levels),
+            "depth": str(self.binding.depth),
+            "best_frame": str(self.best_frame),
+            "size": json.dumps([self.camera.width, self.camera.height]),
+        }
+        partial = target.with_name(target.name + ".partial")
+        save_file({name: value.detach().contiguous().clone() for name, value in tensors.items()}, partial, metadata)
+        os.replace(partial, target)
+
+    @staticmethod
+    def load(path: Path | str) -> Avatar:
+        """Read an avatar from its file or its run directory.
+
+        Raises EngineError ``avatar.not_found`` or ``avatar.corrupt``.
+        """
+        source = Path(path)
+        source = source / FILE_NAME if source.is_dir() else source
+        if not source.is_file():
+            raise EngineError("avatar.not_found", f"There is no avatar at {source}.", "Fit one first.")
+        try:
+            with safe_open(source, framework="pt") as file:
+                metadata = cast("dict[str, str]", file.metadata() or {})
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+            return _assemble(metadata, tensors)
+        except (SafetensorError, KeyError, ValueError, RuntimeError, IndexError) as error:
+            raise EngineError(
+                "avatar.corrupt", f"{source.name} is not a readable avatar ({error}).", "Fit it again."
+            ) from error
+
+
+def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Avatar:
+    if metadata["format"] != _FORMAT:
+        raise ValueError(f"format {metadata['format']!r}, not {_FORMAT!r}")
+    if metadata["side"] not in ("left", "right"):
+        raise ValueError("no side")
+    side = cast("Side", metadata["side"])
+    prefix = "model."
+    model = HandModel.from_tensors(
+        side, {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+    )
+    shape = Shape(
+        model,
+        tensors["shape.betas"],
+        tensors["shape.displacement"],
+        vertex_normals(model.template, model.faces),
+    )
+    width, height = json.loads(metadata["size"])
+    pose = HandPose(
+        tensors["frames.betas"],
+        tensors["frames.global_orient"],
+        tensors["frames.hand_pose"],
+        tensors["frames.transl"],
+        side,
+    )
+    return Avatar(
+        shape,
+        MeshBinding.build(model, int(metadata["levels"]), int(metadata["depth"])),
+        tensors["kept"],
+        Appearance(tensors["albedo"], tensors["opacity_logits"], tensors["sh"], tensors["light"]),
+        Camera(tensors["camera.K"], tensors["camera.world_to_camera"], int(width), int(height)),
+        SourceFrames(tensors["frames.indices"], tensors["frames.heldout"], pose),
+        int(metadata["best_frame"]),
+    )
+
+
+def straight_rgba(out: RenderOutput) -> NDArray[np.uint8]:
+    """Premultiplied colour and alpha -> straight-alpha RGBA uint8 [H,W,4]."""
+    alpha = out.alpha.clamp(0, 1)
+    color = torch.where(alpha.unsqueeze(-1) > 1e-4, out.rgb / alpha.clamp_min(1e-4).unsqueeze(-1), 0.0)
+    picture = torch.cat([color.clamp(0, 1), alpha.unsqueeze(-1)], -1)
+    return cast("NDArray[np.uint8]", (picture * 255).round().to(torch.uint8).numpy())
+

@@ -1,0 +1,188 @@
+"""The command line. Exit codes: 0 done, 2 bad arguments, 3 unusable input, 4 internal failure, 130 interrupted."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+
+from mass_engine.errors import BadArgumentError, EngineError
+from mass_engine.options import DEVICES, PRESETS, SIDES, FitOptions
+from mass_engine.progress import Progress
+
+Command = Callable[[argparse.Namespace], None]
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of ``mass-engine``; every sub-command sets ``run``."""
+    parser = argparse.ArgumentParser(
+        prog="mass-engine", description="A phone video in, a posable hand of 2-D Gaussian surfels out."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    fit = commands.add_parser("fit", help="fit an avatar to a video")
+    fit.add_argument("video", type=Path)
+    fit.add_argument("--out", type=Path, required=True, metavar="RUN")
+    fit.add_argument("--template", default="builtin", metavar="builtin|mano:FILE|gltf:FILE")
+    fit.add_argument("--tracks", type=Path, metavar="FILE", help="use this tracks.json, do not track")
+    fit.add_argument("--masks", type=Path, metavar="DIR", help="DIR/%%06d.png: 0 background, 128 ignore, 255 hand")
+    fit.add_argument("--side", choices=SIDES, default="auto")
+    fit.add_argument("--preset", choices=PRESETS, default="auto")
+    fit.add_argument("--holdout", type=int, default=0, metavar="N", help="keep every N-th frame out of the fit")
+    fit.add_argument("--seed", type=int, default=0)
+    fit.add_argument("--device", choices=DEVICES, default="auto")
+    fit.add_argument("--fov", type=float, metavar="DEGREES", help="field of view of the longer image side")
+    fit.add_argument("--max-frames", type=int, default=FitOptions.max_frames, metavar="N")
+    fit.add_argument("--json", action="store_true", help="progress as JSON lines on standard output")
+    fit.set_defaults(run=_fit)
+
+    render = commands.add_parser("render", help="render an avatar: its frames, or any pose and camera")
+    render.add_argument("run_dir", type=Path, metavar="RUN")
+    render.add_argument("--frames", metavar="all|holdout|12,40")
+    render.add_argument("--pose", metavar="SPEC", help="rest, fist, point, pinch, spread, frame:12 or 48 numbers")
+    render.add_argument("--camera", default="orbit:0,0", metavar="SPEC", help="source, orbit:YAW,PITCH[,METRES] or a JSON file")
+    render.add_argument("--size", default="512x512", metavar="WxH")
+    render.add_argument("--out", type=Path, required=True)
+    render.set_defaults(run=_render)
+
+    export = commands.add_parser("export", help="write the avatar's surfels for other tools")
+    export.add_argument("run_dir", type=Path, metavar="RUN")
+    export.add_argument("--format", choices=("ply", "ply3d"), required=True)
+    export.add_argument("--pose", default="rest", metavar="SPEC")
+    export.add_argument("--out", type=Path, required=True)
+    export.set_defaults(run=_export)
+
+    bench = commands.add_parser("bench", help="measure speed on this machine")
+    bench.add_argument("what", choices=("raster", "render"))
+    bench.add_argument("rest", nargs=argparse.REMAINDER)
+    bench.set_defaults(run=_bench)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    try:
+        arguments = build_parser().parse_args(argv)
+    except SystemExit as stop:  # argparse prints its own usage line
+        return int(stop.code or 0)
+    json_lines = bool(getattr(arguments, "json", False))
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        arguments.run(arguments)
+    except EngineError as error:
+        _report_error(error, json_lines)
+        return 2 if isinstance(error, BadArgumentError) else 3
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except Exception as error:
+        traceback.print_exc()
+        internal = EngineError(
+            "engine.internal",
+            f"{type(error).__name__}: {error}",
+            "This is a fault of the program: please report it with the lines above.",
+        )
+        _report_error(internal, json_lines)
+        return 4
+    return 0
+
+
+def _interrupt(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _report_error(error: EngineError, json_lines: bool) -> None:
+    if json_lines:
+        _emit(type="error", code=error.code, message=error.message, advice=error.advice)
+    print(f"error: {error.code}: {error.message} {error.advice}", file=sys.stderr)
+
+
+def _emit(**fields: object) -> None:
+    print(json.dumps(fields), flush=True)
+
+
+def _fit(arguments: argparse.Namespace) -> None:
+    options = FitOptions(
+        template=arguments.template,
+        tracks=arguments.tracks,
+        masks=arguments.masks,
+        side=arguments.side,
+        preset=arguments.preset,
+        holdout=arguments.holdout,
+        seed=arguments.seed,
+        device=arguments.device,
+        fov=arguments.fov,
+        max_frames=arguments.max_frames,
+    )
+    from mass_engine.pipeline import fit_to_directory  # heavy imports only once the arguments are good
+
+    if arguments.json:
+
+        def report(step: Progress) -> None:
+            left = None if step.time_left is None else round(step.time_left, 1)
+            _emit(
+                type="progress",
+                stage=step.stage,
+                fraction=round(step.fraction, 4),
+                time_left=left,
+                message=step.message,
+            )
+
+        def warn(code: str, message: str, advice: str) -> None:
+            _emit(type="warning", code=code, message=message, advice=advice)
+
+        fit_to_directory(arguments.video, arguments.out, options, report, warn)
+        _emit(type="done", report=str(arguments.out / "report.json"))
+        return
+
+    from mass_engine.terminal import TerminalProgress
+
+    with TerminalProgress() as bar:
+        result = fit_to_directory(arguments.video, arguments.out, options, bar.report, bar.warn)
+    print(result.summary())
+    print(f"wrote {arguments.out}")
+
+
+def _render(arguments: argparse.Namespace) -> None:
+    from mass_engine.rendering import render_frames, render_to_file
+
+    if (arguments.frames is None) == (arguments.pose is None):
+        raise BadArgumentError(
+            "render.what", "Say what to render.", "Give either --frames or --pose, not both."
+        )
+    if arguments.frames is not None:
+        count = render_frames(arguments.run_dir, arguments.frames, arguments.out)
+        print(f"wrote {count} frames to {arguments.out}")
+    else:
+        render_to_file(arguments.run_dir, arguments.pose, arguments.camera, arguments.size, arguments.out)
+        print(f"wrote {arguments.out}")
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from mass_engine.avatar import Avatar
+    from mass_engine.export.ply import write_ply
+
+    avatar = Avatar.load(arguments.run_dir)
+    flavour = "3dgs" if arguments.format == "ply3d" else "2dgs"
+    write_ply(avatar.cloud(arguments.pose), arguments.out, flavour)
+    print(f"wrote {arguments.out}")
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    if arguments.what == "raster":
+        from mass_engine.evaluation import bench_raster
+
+        bench_raster.run(arguments.rest)
+    else:
+        from mass_engine.evaluation import bench_render
+
+        bench_render.run(arguments.rest)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

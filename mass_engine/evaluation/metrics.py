@@ -1,0 +1,77 @@
+"""Image metrics with their conventions in their names. Images are float [H,W,3] in 0..1."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+#: The published weights of the five scales of MS-SSIM (Wang, Simoncelli and Bovik 2003).
+MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+def to_8bit(image: Tensor) -> Tensor:
+    """Rounded to the 256 levels of a saved picture, still float in 0..1."""
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB over all pixels, or over those of ``mask`` bool [H,W]."""
+    squared = (image - target).square().mean(-1)
+    error = float(squared.mean() if mask is None else squared[mask].mean())
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def _gaussian(size: int, sigma: float, like: Tensor) -> Tensor:
+    offset = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
+    weights = torch.exp(-0.5 * (offset / sigma) ** 2)
+    return weights / weights.sum()
+
+
+def _blur(planes: Tensor, window: Tensor) -> Tensor:
+    """Separable filter without padding; ``planes`` [C,1,H,W]."""
+    row = functional.conv2d(planes, window.view(1, 1, 1, -1))
+    return functional.conv2d(row, window.view(1, 1, -1, 1))
+
+
+def ssim_maps(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """SSIM and its contrast-structure part, each [3,H-10,W-10]: 11x11 Gaussian window, sigma 1.5, valid."""
+    x, y = image.permute(2, 0, 1).unsqueeze(1), target.permute(2, 0, 1).unsqueeze(1)
+    moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), _gaussian(11, 1.5, image))[:, 0]
+    mx, my, xx, yy, xy = moments.unflatten(0, (5, 3))
+    structure = (2 * (xy - mx * my) + _C2) / (xx - mx * mx + yy - my * my + _C2)
+    return structure * (2 * mx * my + _C1) / (mx * mx + my * my + _C1), structure
+
+
+def ssim_valid(image: Tensor, target: Tensor) -> float:
+    """Mean SSIM without padding (Wang et al. 2004; the convention of HandAvatar)."""
+    return float(ssim_maps(image, target)[0].mean())
+
+
+def ms_ssim(image: Tensor, target: Tensor) -> float:
+    """Multi-scale SSIM, five scales, valid windows. NaN when a side is under 176 pixels."""
+    if min(image.shape[:2]) < 176:
+        return math.nan
+    result = torch.ones(3, dtype=image.dtype)
+    for scale, weight in enumerate(MS_SSIM_WEIGHTS):
+        full, structure = ssim_maps(image, target)
+        last = scale == len(MS_SSIM_WEIGHTS) - 1
+        result = result * (full if last else structure).mean((1, 2)).clamp_min(0) ** weight
+        if not last:
+            image, target = (_halve(picture) for picture in (image, target))
+    return float(result.mean())
+
+
+def _halve(image: Tensor) -> Tensor:
+    return functional.avg_pool2d(image.permute(2, 0, 1), 2).permute(1, 2, 0)
+
+
+def iou(mask: Tensor, target: Tensor, valid: Tensor | None = None) -> float:
+    """Intersection over union of two bool masks [H,W], over the ``valid`` pixels; 1 when both are empty."""
+    if valid is not None:
+        mask, target = mask & valid, target & valid
+    union = int((mask | target).sum())
+    return 1.0 if union == 0 else int((mask & target).sum()) / union

@@ -1,0 +1,197 @@
+"""Stage one: poses, shape and personal surface, with low-frequency colour, coarse to fine.
+
+The same loop refines the poses of held-out frames: then everything shared is frozen and colour is off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from mass_engine.camera import Camera
+from mass_engine.fitting import losses
+from mass_engine.fitting.poses import PoseTable
+from mass_engine.fitting.subject import Appearance, Shape, mesh_edges, pose_surfels, render_row
+from mass_engine.fitting.views import View
+from mass_engine.hand.builtin import JOINT_LIMITS, joint_frames
+from mass_engine.raster import RasterOptions
+from mass_engine.surfel.binding import MeshBinding
+from mass_engine.tracking.alignment import hand_size_pixels, limit_excess
+
+
+@dataclass(frozen=True)
+class GeometryWeights:
+    """What each term weighs in stage one."""
+
+    color: float = 1.0
+    silhouette: float = 1.0
+    landmarks: float = 0.5
+    limits: float = 5.0
+    smooth: float = 2.0
+    shape: float = 1e-3
+    laplacian: float = 2e4  # per metre^2 across an edge
+    thickness: float = 2e3  # per metre^2 of displacement
+
+
+@dataclass(frozen=True)
+class GeometryPass:
+    """One resolution of stage one: how large, how often each frame is seen, and what may move."""
+
+    side: int
+    visits: float
+    rate: float = 1.0
+    batch: int = 4
+    color: bool = True
+    shared: bool = True  # shape, displacement and colour move too, not only the poses
+    weights: GeometryWeights = field(default_factory=GeometryWeights)
+
+
+#: Learning rates of what all frames share: standard deviations, metres, colour, light.
+SHARED_RATES = {"betas": 0.02, "displacement": 1.5e-4, "albedo": 0.02, "light": 0.005}
+
+
+class GeometryFit:
+    """Stage one over ``views`` (rows of ``table``), with surfels of ``binding``."""
+
+    def __init__(
+        self,
+        views: list[View],
+        table: PoseTable,
+        shape: Shape,
+        appearance: Appearance,
+        binding: MeshBinding,
+        camera: Camera,
+        seed: int,
+        raster: RasterOptions,
+    ) -> None:
+        self.views, self.table, self.shape, self.appearance = views, table, shape, appearance
+        self.binding, self.camera, self.raster = binding, camera, raster
+        self.rejected_steps = 0
+        self._random = torch.Generator().manual_seed(seed)
+        self._edges = mesh_edges(shape.model.faces)
+        self._limits, self._frames = JOINT_LIMITS(shape.model.side), joint_frames(shape.model.side)
+        self._points = torch.stack([torch.from_numpy(view.points) for view in views])
+        self._sizes = hand_size_pixels(self._points)
+        self._scores = torch.tensor([view.score for view in views])
+        self._times = torch.tensor([view.time for view in views], dtype=torch.float64)
+        trained = [row for row, view in enumerate(views) if not view.heldout]
+        self._trained = torch.tensor(trained)
+        self._before, self._after, self._mix, self._near = _neighbours(views, trained)
+        with torch.no_grad():
+            self._joints = shape.model.joints(table.pose(shape.betas))
+
+    def run(
+        self, stage: GeometryPass, rows: Tensor | None = None, progress: Callable[[float], None] | None = None
+    ) -> None:
+        """Run one pass over ``rows`` (the training rows unless given)."""
+        rows = self._trained if rows is None else rows
+        steps = max(1, round(stage.visits * len(rows) / stage.batch))
+        shared = self._shared_parameters() if stage.shared else {}
+        optimizer = torch.optim.Adam(
+            [{"params": [value], "lr": SHARED_RATES[name] * stage.rate} for name, value in shared.items()]
+            or [{"params": [torch.zeros(1, requires_grad=True)]}],
+            betas=(0.9, 0.98),
+            eps=1e-15,
+        )
+        self.table.reset_momentum()
+        queue = torch.zeros(0, dtype=torch.long)
+        for step in range(steps):
+            if len(queue) < stage.batch:
+                queue = torch.cat([queue, rows[torch.randperm(len(rows), generator=self._random)]])
+            chosen, queue = queue[: stage.batch].unique(), queue[stage.batch :]
+            decay = 0.1 ** (step / steps)
+            for group, name in zip(optimizer.param_groups, shared, strict=False):
+                group["lr"] = SHARED_RATES[name] * stage.rate * decay
+            leaves = self.table.leaves(chosen)
+            optimizer.zero_grad(set_to_none=True)
+            loss = self._loss(stage, chosen, leaves)
+            loss.backward()  # type: ignore[no-untyped-call]
+            if not self._finite(loss, leaves, shared):
+                self.rejected_steps += 1  # a step that would poison the state is not taken
+                continue
+            self.table.step(chosen, leaves, stage.rate * decay)
+            if stage.shared:
+                optimizer.step()
+            if progress is not None:
+                progress((step + 1) / steps)
+        for value in shared.values():
+            value.requires_grad_(False)
+
+    def _shared_parameters(self) -> dict[str, Tensor]:
+        parameters = {
+            "betas": self.shape.betas,
+            "displacement": self.shape.displacement,
+            "albedo": self.appearance.albedo,
+            "light": self.appearance.light,
+        }
+        return {name: value.requires_grad_(True) for name, value in parameters.items()}
+
+    @staticmethod
+    def _finite(loss: Tensor, leaves: dict[str, Tensor], shared: dict[str, Tensor]) -> bool:
+        grads = [value.grad for value in (*leaves.values(), *shared.values()) if value.grad is not None]
+        return bool(torch.isfinite(loss)) and all(bool(torch.isfinite(grad).all()) for grad in grads)
+
+    def _loss(self, stage: GeometryPass, rows: Tensor, leaves: dict[str, Tensor]) -> Tensor:
+        w = stage.weights
+        surfels = pose_surfels(self.shape, self.binding, self.table.pose(self.shape.betas, leaves))
+        total = torch.zeros(())
+        for place, row in enumerate(rows.tolist()):
+            level = self.views[row].level(stage.side)
+            background = torch.rand(3, generator=self._random)
+            out = render_row(
+                self.appearance,
+                surfels,
+                place,
+                self.binding.bones,
+                level.camera,
+                self.raster,
+                background if stage.color else None,
+            )
+            area = level.hand.sum().clamp_min(16.0)
+            total = total + w.silhouette * losses.silhouette(out.alpha, level.hand, level.valid, area)
+            if stage.color:
+                cover = level.hand.unsqueeze(-1)
+                target = level.rgb * cover + background * (1 - cover)
+                total = total + w.color * losses.photometric(out.rgb, target, level.valid, area)
+        total = total + self._pose_terms(w, rows, leaves, surfels.joints) * len(rows)
+        total = total / len(rows)
+        if stage.shared:
+            d = self.shape.displacement
+            total = total + w.shape * self.shape.betas.square().sum()
+            total = total + w.laplacian * losses.laplacian(d, self._edges)
+            total = total + w.thickness * d.square().mean()
+        return total
+
+    def _pose_terms(
+        self, w: GeometryWeights, rows: Tensor, leaves: dict[str, Tensor], joints: Tensor
+    ) -> Tensor:
+        """Landmarks, joint limits and smoothness in time, averaged over the batch."""
+        pixels = (self.camera.project(joints) - self._points[rows]).norm(dim=-1)
+        apart = losses.charbonnier(pixels / self._sizes[rows, None], 0.03).mean(-1) * self._scores[rows]
+        excess = limit_excess(leaves["hand_pose"], self._limits, self._frames).square().sum((-1, -2))
+        mix = self._mix[rows].view(-1, 1, 1)
+        between = self._joints[self._before[rows]] * (1 - mix) + self._joints[self._after[rows]] * mix
+        jerk = losses.charbonnier((joints - between).norm(dim=-1) / 0.18, 0.03).mean(-1)
+        self._joints[rows] = joints.detach()
+        return (w.landmarks * apart + w.limits * excess + w.smooth * self._near[rows] * jerk).mean()
+
+
+def _neighbours(views: list[View], trained: list[int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """For every row: the training rows before and after, where between them it lies, and how near they are."""
+    before, after, mix, near = [], [], [], []
+    for row, view in enumerate(views):
+        earlier = [other for other in trained if views[other].time < view.time]
+        later = [other for other in trained if views[other].time > view.time]
+        if not earlier or not later:
+            before.append(row), after.append(row), mix.append(0.5), near.append(0.0)
+            continue
+        low, high = views[earlier[-1]].time, views[later[0]].time
+        before.append(earlier[-1])
+        after.append(later[0])
+        mix.append((view.time - low) / (high - low))
+        # Two frames apart at 30 a second is near; the pull falls with the square of the span.
+        near.append(min(1.0, ((high - low) * 15) ** -2))
+    return torch.tensor(before), torch.tensor(after), torch.tensor(mix), torch.tensor(near)

@@ -1,0 +1,46 @@
+"""Losses of the fit, one function each. Pictures are [h,w,3] in 0..1, masks [h,w] in 0..1."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+def charbonnier(difference: Tensor, scale: float) -> Tensor:
+    """Smooth absolute value: quadratic below ``scale``, linear above it; same shape as the input."""
+    return ((difference / scale) ** 2 + 1).sqrt().sub(1).mul(scale)
+
+
+def photometric(rgb: Tensor, target: Tensor, valid: Tensor, area: Tensor) -> Tensor:
+    """Robust L1 over the valid pixels, per pixel of hand ``area`` (scalar): paper's L_c, first part."""
+    return (charbonnier(rgb - target, 0.01).mean(-1) * valid).sum() / area
+
+
+def silhouette(alpha: Tensor, hand: Tensor, valid: Tensor, area: Tensor) -> Tensor:
+    """|alpha - hand| over the valid pixels, per pixel of hand area: paper's L_sil with ignore regions."""
+    return (charbonnier(alpha - hand, 0.05) * valid).sum() / area
+
+
+def dssim(rgb: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """(1 - SSIM) / 2 with a 7x7 box window (zero outside), averaged over the valid pixels.
+
+    The box is what a CPU does fast; the reported metric uses the Gaussian window (evaluation.metrics).
+    """
+    x, y = (picture.permute(2, 0, 1).unsqueeze(0) for picture in (rgb, target))
+    planes = torch.cat([x, y, x * x, y * y, x * y], 1)
+    mx, my, xx, yy, xy = functional.avg_pool2d(planes, 7, 1, 3, count_include_pad=False)[0].unflatten(
+        0, (5, 3)
+    )
+    ssim = ((2 * mx * my + _C1) * (2 * (xy - mx * my) + _C2)) / (
+        (mx * mx + my * my + _C1) * ((xx - mx * mx).clamp_min(0) + (yy - my * my).clamp_min(0) + _C2)
+    )
+    weight = valid.sum().clamp_min(1.0)
+    return ((1 - ssim.mean(0)) * 0.5 * valid).sum() / weight
+
+
+def laplacian(values: Tensor, edges: Tensor) -> Tensor:
+    """Mean squared difference of ``values`` [V] across the mesh's ``edges`` [E,2]."""
+    return (values[edges[:, 0]] - values[edges[:, 1]]).square().mean()

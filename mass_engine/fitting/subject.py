@@ -1,0 +1,128 @@
+"""The subject of a fit: one hand's shape, its personal surface and what its surfels look like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mass_engine.camera import Camera
+from mass_engine.hand.model import HandModel
+from mass_engine.hand.pose import HandPose
+from mass_engine.raster import RasterOptions, RenderOutput, rasterize
+from mass_engine.surfel.binding import MeshBinding
+from mass_engine.surfel.harmonics import evaluate_sh_rest
+from mass_engine.surfel.shading import shade
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Area-weighted unit normals [V,3] of a mesh."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    face_normals = torch.linalg.cross(b - a, c - a)
+    total = torch.zeros_like(vertices)
+    for corner in range(3):
+        total = total.index_add(0, faces[:, corner], face_normals)
+    return torch.nn.functional.normalize(total, dim=-1)
+
+
+def mesh_edges(faces: Tensor) -> Tensor:
+    """Unique undirected edges [E,2] of ``faces`` [F,3]."""
+    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return torch.unique(pairs.sort(dim=1).values, dim=0)
+
+
+@dataclass
+class Shape:
+    """``betas`` [10] and a displacement [V] in metres along the rest normals (the personal surface)."""
+
+    model: HandModel
+    betas: Tensor
+    displacement: Tensor
+    normals: Tensor
+
+    @staticmethod
+    def mean(model: HandModel, betas: Tensor) -> Shape:
+        """No displacement yet."""
+        normals = vertex_normals(model.template, model.faces)
+        return Shape(model, betas.clone(), torch.zeros(len(model.template)), normals)
+
+    def offsets(self) -> Tensor:
+        """Canonical vertex offsets [V,3]."""
+        return self.normals * self.displacement.unsqueeze(-1)
+
+
+@dataclass
+class Appearance:
+    """Per surfel: ``albedo`` [N,3], ``opacity_logits`` [N], ``sh`` [N,K,3] of degree 1 on in the rest
+    frame of the surfel's bone (K = 0, 3, 8 or 15); for the clip: ``light`` [9,3]."""
+
+    albedo: Tensor
+    opacity_logits: Tensor
+    sh: Tensor
+    light: Tensor
+
+
+@dataclass
+class PosedSurfels:
+    """Surfels of a batch of poses: ``means`` [B,N,3], ``scales`` [B,N,2], ``quats`` [B,N,4], ``normals``
+    [B,N,3], ``bone_rotations`` [B,16,3,3] and ``joints`` [B,21,3]."""
+
+    means: Tensor
+    scales: Tensor
+    quats: Tensor
+    normals: Tensor
+    bone_rotations: Tensor
+    joints: Tensor
+
+
+def quat_normal(quats: Tensor) -> Tensor:
+    """The third axis of the rotations ``quats`` [...,4] (wxyz, unit) -> [...,3]."""
+    w, x, y, z = quats.unbind(-1)
+    return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
+
+
+def pose_surfels(shape: Shape, binding: MeshBinding, pose: HandPose) -> PosedSurfels:
+    """Pose the hand and register a surfel in every small triangle; ``pose`` is batched [B]."""
+    posed = shape.model.posed(pose, shape.offsets())
+    means, scales, quats = binding.surfels(posed.vertices)
+    return PosedSurfels(
+        means, scales, quats, quat_normal(quats), posed.bone_transforms[..., :3, :3], posed.joints
+    )
+
+
+def surfel_colors(
+    appearance: Appearance, surfels: PosedSurfels, row: int, bones: Tensor, camera: Camera
+) -> Tensor:
+    """Colours [N,3] of the ``row``-th pose seen by ``camera``; ``bones`` [N] is each surfel's bone."""
+    colors = shade(appearance.albedo, appearance.light, surfels.normals[row])
+    if appearance.sh.shape[1] == 0:
+        return colors
+    rotation = camera.world_to_camera[:3, :3]
+    center = -rotation.T @ camera.world_to_camera[:3, 3]
+    directions = torch.nn.functional.normalize(surfels.means[row].detach() - center, dim=-1)
+    # Into the rest frame of the bone: what the skin does with light turns with the skin.
+    turned = torch.einsum("nji,nj->ni", surfels.bone_rotations[row][bones].detach(), directions)
+    return (colors + evaluate_sh_rest(appearance.sh, turned)).clamp_min(0.0)
+
+
+def render_row(
+    appearance: Appearance,
+    surfels: PosedSurfels,
+    row: int,
+    bones: Tensor,
+    camera: Camera,
+    options: RasterOptions,
+    background: Tensor | None = None,
+) -> RenderOutput:
+    """Rasterise the ``row``-th pose."""
+    return rasterize(
+        surfels.means[row],
+        surfels.quats[row],
+        surfels.scales[row],
+        torch.sigmoid(appearance.opacity_logits),
+        surfel_colors(appearance, surfels, row, bones, camera),
+        camera,
+        background=background,
+        options=options,
+    )

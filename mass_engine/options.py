@@ -1,0 +1,61 @@
+"""What a user may choose about a fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mass_engine.errors import BadArgumentError
+
+PRESETS = ("draft", "auto", "full")
+SIDES = ("auto", "left", "right")
+DEVICES = ("auto", "cpu", "cuda")
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Options of :func:`mass_engine.fit`; the command line has a flag of the same name for each.
+
+    ``holdout`` N keeps the frames N-1, 2N-1, ... out of the fit (0: none). ``fov`` in degrees spans the
+    longer image side; None takes the phone-like default and says so in the report. ``max_frames`` bounds
+    the frames the fit sees; held-out frames do not count.
+    """
+
+    template: str = "builtin"
+    tracks: Path | None = None
+    masks: Path | None = None
+    side: str = "auto"
+    preset: str = "auto"
+    holdout: int = 0
+    seed: int = 0
+    device: str = "auto"
+    fov: float | None = None
+    max_frames: int = 240
+
+    def __post_init__(self) -> None:
+        checks = (
+            (self.preset in PRESETS, "preset", self.preset, f"Use one of {', '.join(PRESETS)}."),
+            (self.side in SIDES, "side", self.side, f"Use one of {', '.join(SIDES)}."),
+            (self.device in DEVICES, "device", self.device, f"Use one of {', '.join(DEVICES)}."),
+            (self.holdout == 0 or self.holdout >= 2, "holdout", self.holdout, "Use 0, or 2 and more."),
+            (self.fov is None or 5 <= self.fov <= 150, "fov", self.fov, "Use 5 to 150 degrees."),
+            (2 <= self.max_frames <= 10_000, "max_frames", self.max_frames, "Use 2 to 10000."),
+            (0 <= self.seed < 2**63, "seed", self.seed, "Use a number from 0 on."),
+        )
+        for good, name, value, advice in checks:
+            if not good:
+                raise BadArgumentError("options.invalid", f"{name} cannot be {value!r}.", advice)
+        if self.device == "cuda":
+            raise BadArgumentError(
+                "device.unavailable", "There are no GPU kernels in this build.", "Use --device cpu or auto."
+            )
+        if self.template != "builtin":
+            raise BadArgumentError(
+                "template.unsupported",
+                f"The hand template {self.template!r} cannot be read by this version.",
+                "Use --template builtin.",
+            )
+
+    def is_heldout(self, index: int) -> bool:
+        """Whether the frame with this index is kept out of the fit."""
+        return self.holdout > 0 and index % self.holdout == self.holdout - 1

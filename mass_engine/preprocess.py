@@ -1,0 +1,258 @@
+"""From a video to what the fit starts from: crops, masks, and one aligned pose a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mass_engine.camera import Camera
+from mass_engine.errors import EngineError
+from mass_engine.fitting.views import View
+from mass_engine.hand.builtin import load_builtin
+from mass_engine.hand.model import HandModel
+from mass_engine.hand.pose import HandPose
+from mass_engine.options import FitOptions
+from mass_engine.progress import ProgressMeter
+from mass_engine.tracking.alignment import align_landmarks, interpolate_pose
+from mass_engine.tracking.landmarks import HandLandmarks
+from mass_engine.tracking.models import HandNetworks
+from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE, HandMask, HandSegmenter, hand_box
+from mass_engine.tracking.track import track_main_hand
+from mass_engine.tracking.tracks import Tracks, read_tracks
+from mass_engine.video.reader import Frame, VideoInfo, VideoWarning, probe, read_frames
+
+#: Field of view of the longer image side when the user gives none, degrees: a phone's main camera.
+ASSUMED_FOV = 60.0
+#: Crops larger than this on a side are reduced: a fit in minutes cannot use more.
+CROP_LIMIT = 640
+#: Frames the colour model of the masks is trained on.
+MASK_SAMPLES = 24
+
+Warn = Callable[[str, str, str], None]
+
+
+@dataclass(frozen=True)
+class Clip:
+    """``views`` in time order with their ``start`` poses [F]; ``tracked`` counts frames with a hand."""
+
+    info: VideoInfo
+    camera: Camera
+    fov_assumed: bool
+    model: HandModel
+    views: list[View]
+    start: HandPose
+    frames_read: int
+    tracked: int
+
+
+def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) -> Clip:
+    """Read, track, segment and align. Raises EngineError when the video cannot be used."""
+    meter.update("read", 0.0)
+    info = probe(video)
+    imported = None
+    if options.tracks is not None:
+        imported = read_tracks(options.tracks, options.side, (info.width, info.height))
+    marks, times = _landmarks(video, info, options, imported, meter, warn)
+    camera = Camera.from_fov(info.width, info.height, options.fov or ASSUMED_FOV)
+    if imported is not None and options.fov is None:
+        camera = replace(camera, K=imported.K)
+    model = load_builtin(marks[0].side)
+    chosen = _choose(marks, options)
+    views = _cut_views(video, chosen, times, camera, options, meter)
+    if imported is None:
+        start = _align(model, views, chosen, camera, meter)
+    else:
+        start = _rows_of(imported, [view.index for view in views])
+    return Clip(
+        info, camera, options.fov is None and imported is None, model, views, start, len(times), len(marks)
+    )
+
+
+def _landmarks(
+    video: Path, info: VideoInfo, options: FitOptions, imported: Tracks | None, meter: ProgressMeter, warn: Warn
+) -> tuple[list[HandLandmarks], dict[int, float]]:
+    """Trusted landmarks of the main hand in time order, and the time of every frame read."""
+    times: dict[int, float] = {}
+
+    def hear(warning: VideoWarning) -> None:
+        if warning.code == "video.truncated":
+            raise EngineError(warning.code, warning.message, "Record or upload the whole file again.")
+        warn(warning.code, warning.message, "Look at the result with care.")
+
+    def frames() -> Iterator[Frame]:
+        for frame in read_frames(video, on_warning=hear):
+            times[frame.index] = frame.time
+            if info.frames:
+                meter.update("track", frame.index / info.frames)
+            yield frame
+
+    if imported is None:
+        track = track_main_hand(frames(), HandNetworks.load(), options.is_heldout, side=options.side)
+        return [mark for mark in track.landmarks if mark.trusted], times
+    for _ in frames():
+        pass
+    world = imported.joints3d - imported.joints3d.mean(1, keepdims=True)
+    marks = [
+        HandLandmarks(index, imported.pose.side, imported.landmarks2d[row], world[row], imported.scores[row], 0.5)
+        for row, index in enumerate(imported.indices)
+        if index in times
+    ]
+    if len(marks) < 2:
+        raise EngineError(
+            "tracks.other_video", "The tracks name no frames of this video.", "Give the tracks of this video."
+        )
+    return marks, times
+
+
+def _choose(marks: Sequence[HandLandmarks], options: FitOptions) -> list[HandLandmarks]:
+    """Every held-out frame, and at most ``max_frames`` others spread evenly over the clip."""
+    train = [mark for mark in marks if not options.is_heldout(mark.index)]
+    if len(train) < 2:
+        raise EngineError(
+            "video.no_hand",
+            f"Only {len(train)} frames to fit show a hand.",
+            "Film one hand, whole, in good light, for a few seconds.",
+        )
+    if len(train) > options.max_frames:
+        rows = np.linspace(0, len(train) - 1, options.max_frames).round().astype(int)
+        train = [train[row] for row in np.unique(rows)]
+    keep = {mark.index for mark in train}
+    return [mark for mark in marks if mark.index in keep or options.is_heldout(mark.index)]
+
+
+def _cut_views(
+    video: Path,
+    marks: Sequence[HandLandmarks],
+    times: dict[int, float],
+    camera: Camera,
+    options: FitOptions,
+    meter: ProgressMeter,
+) -> list[View]:
+    """Second pass over the video: crops around the hand, then their masks."""
+    crops: list[tuple[HandLandmarks, tuple[int, int, int, int], NDArray[np.uint8]]] = []
+    wanted = {mark.index: mark for mark in marks}
+    last = max(wanted)
+    for frame in read_frames(video):
+        mark = wanted.get(frame.index)
+        if mark is not None:
+            x, y, w, h = box = hand_box(mark.points, *frame.rgb.shape[:2])
+            crops.append((mark, box, frame.rgb[y : y + h, x : x + w].copy()))
+            meter.update("segment", 0.2 * len(crops) / len(marks))
+        if frame.index >= last:
+            break
+    moved = [replace(mark, points=mark.points - np.float32([box[0], box[1]])) for mark, box, _ in crops]
+    if options.masks is None:
+        train = [row for row, (mark, _, _) in enumerate(crops) if not options.is_heldout(mark.index)]
+        picked = np.unique(np.linspace(0, len(train) - 1, min(MASK_SAMPLES, len(train))).round().astype(int))
+        segmenter = HandSegmenter.train([(crops[train[i]][2], moved[train[i]]) for i in picked])
+        with ThreadPoolExecutor(2) as pool:
+            masks = []
+            for done, mask in enumerate(pool.map(lambda i: segmenter(crops[i][2], moved[i]), range(len(crops)))):
+                masks.append(mask)
+                meter.update("segment", 0.2 + 0.8 * (done + 1) / len(crops))
+    else:
+        masks = [_user_mask(options.masks, mark.index, box, camera) for mark, box, _ in crops]
+    return [
+        _view(mark, times[mark.index], options.is_heldout(mark.index), box, rgb, mask, camera)
+        for (mark, box, rgb), mask in zip(crops, masks, strict=True)
+    ]
+
+
+def _view(
+    mark: HandLandmarks,
+    time: float,
+    heldout: bool,
+    box: tuple[int, int, int, int],
+    rgb: NDArray[np.uint8],
+    mask: HandMask,
+    camera: Camera,
+) -> View:
+    height, width = rgb.shape[:2]
+    labels = mask.full(height, width)
+    view_camera = camera.crop(*box)
+    scale = CROP_LIMIT / max(height, width)
+    if scale < 1:
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+        labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        view_camera = view_camera.resized(*size)
+    return View(mark.index, time, heldout, rgb, labels, view_camera, mark.points, mark.score)
+
+
+def _user_mask(directory: Path, index: int, box: tuple[int, int, int, int], camera: Camera) -> HandMask:
+    """The user's mask DIR/%06d.png: 0 background, 255 hand, anything between: ignored."""
+    path = directory / f"{index:06d}.png"
+    full = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if full is None:
+        raise EngineError(
+            "masks.missing",
+            f"There is no readable mask {path.name}.",
+            "Give one 8-bit grey PNG per frame, named by its index with six digits.",
+        )
+    if full.shape != (camera.height, camera.width):
+        raise EngineError(
+            "masks.wrong_size",
+            f"{path.name} is {full.shape[1]}x{full.shape[0]}, the video {camera.width}x{camera.height}.",
+            "Give masks at the video's upright size.",
+        )
+    x, y, w, h = box
+    part = full[y : y + h, x : x + w]
+    labels = np.full(part.shape, IGNORE, np.uint8)
+    labels[part == 0] = BACKGROUND
+    labels[part == 255] = HAND
+    return HandMask((0, 0, w, h), labels)
+
+
+def _align(
+    model: HandModel, views: list[View], marks: Sequence[HandLandmarks], camera: Camera, meter: ProgressMeter
+) -> HandPose:
+    """Shape and poses of the training frames first; then held-out poses under that shape."""
+    train = [row for row, view in enumerate(views) if not view.heldout]
+    held = [row for row, view in enumerate(views) if view.heldout]
+    main = align_landmarks(
+        model,
+        [marks[row] for row in train],
+        [views[row].time for row in train],
+        camera,
+        progress=lambda fraction: meter.update("align", 0.8 * fraction),
+    ).pose
+    if not held:
+        return main
+    start = interpolate_pose(main, [views[row].time for row in train], [views[row].time for row in held])
+    rest = align_landmarks(
+        model,
+        [marks[row] for row in held],
+        [views[row].time for row in held],
+        camera,
+        betas=main.betas[0],
+        start=start,
+        iterations=150,
+        progress=lambda fraction: meter.update("align", 0.8 + 0.2 * fraction),
+    ).pose
+    order = torch.tensor(train + held).argsort()
+    return HandPose(
+        main.betas[:1].expand(len(views), 10),
+        torch.cat([main.global_orient, rest.global_orient])[order],
+        torch.cat([main.hand_pose, rest.hand_pose])[order],
+        torch.cat([main.transl, rest.transl])[order],
+        main.side,
+    )
+
+
+def _rows_of(tracks: Tracks, indices: Sequence[int]) -> HandPose:
+    rows = torch.tensor([tracks.indices.index(index) for index in indices])
+    pose = tracks.pose
+    return HandPose(
+        pose.betas.mean(0, keepdim=True).expand(len(rows), 10),
+        pose.global_orient[rows],
+        pose.hand_pose[rows],
+        pose.transl[rows],
+        pose.side,
+    )

@@ -1,0 +1,180 @@
+// Front to back over one tile: the forward pass.
+#pragma once
+
+#include "reduce.hpp"
+#include "sample.hpp"
+
+namespace mass::MASS_ISA {
+
+struct alignas(64) TileForward {
+    float transmittance[kBlocksPerTile][kLanes];  // negative once the pixel has ended
+    float r[kBlocksPerTile][kLanes], g[kBlocksPerTile][kLanes], b[kBlocksPerTile][kLanes];
+    float depth[kBlocksPerTile][kLanes];
+    float stop[kBlocksPerTile][kLanes];
+};
+
+struct alignas(64) TileForwardExtra {
+    float median[kBlocksPerTile][kLanes], median_rank[kBlocksPerTile][kLanes];
+    float nx[kBlocksPerTile][kLanes], ny[kBlocksPerTile][kLanes], nz[kBlocksPerTile][kLanes];
+    float q0[kBlocksPerTile][kLanes];  // inverse depth of the first surfel: moments are taken about it
+    float weight[kBlocksPerTile][kLanes], m1[kBlocksPerTile][kLanes], m2[kBlocksPerTile][kLanes];
+    float distortion[kBlocksPerTile][kLanes];
+};
+
+// A block's bit is set while one of its pixels goes on.
+MASS_INLINE unsigned start_tile(const TileWindow& w, TileForward& t, float length) {
+    unsigned live = 0;
+    __builtin_memset(&t, 0, sizeof t);
+    for (int y = 0; y < kTile; ++y) {
+        for (int x = 0; x < kTile; ++x) {
+            const int at = lane_of(x, y);
+            const bool inside = x < w.width && y < w.height;
+            (&t.transmittance[0][0])[at] = inside ? 1.0f : -1.0f;
+            (&t.stop[0][0])[at] = length;
+            live |= static_cast<unsigned>(inside) << (at / kLanes);
+        }
+    }
+    return live;
+}
+
+template <bool kExtra>
+MASS_INLINE void accumulate_extra(const Splat& s, const Normal* normal, const Sample& p, M blended, F w, F before,
+                                  F depth, F rank, float distortion_scale, TileForwardExtra& e, int block) {
+    if constexpr (kExtra) {
+        const M early = both(blended, lt(splat(kMedianTransmittance), before));
+        store(e.median[block], select(early, depth, load(e.median[block])));
+        store(e.median_rank[block], select(early, rank, load(e.median_rank[block])));
+        store(e.nx[block], fma(w, splat(normal->x), load(e.nx[block])));
+        store(e.ny[block], fma(w, splat(normal->y), load(e.ny[block])));
+        store(e.nz[block], fma(w, splat(normal->z), load(e.nz[block])));
+        // m = a - b / z; the constant a cancels, and so does the shift by the first surfel's b / z.
+        const F q = mul(select(p.solid, p.pz, splat(1.0f)), splat(1.0f / s.zc));
+        const F weight = load(e.weight[block]), m1 = load(e.m1[block]), m2 = load(e.m2[block]);
+        const M first = both(blended, eq(weight, splat(0.0f)));
+        const F q0 = select(first, q, load(e.q0[block]));
+        const F m = keep(blended, mul(splat(distortion_scale), sub(q0, q)));
+        const F pairwise = fma(mul(m, m), weight, fnma(add(m, m), m1, m2));
+        store(e.q0[block], q0);
+        store(e.distortion[block], fma(w, pairwise, load(e.distortion[block])));
+        store(e.weight[block], add(weight, w));
+        store(e.m1[block], fma(w, m, m1));
+        store(e.m2[block], fma(mul(w, m), m, m2));
+    }
+}
+
+template <bool kExtra, bool kWeights>
+static void blend_tile(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& out,
+                       const PixelState& state, float* slot_weights, int tile) {
+    const TileWindow window = tile_window(camera, tile);
+    const uint32_t begin = pairs.tile_begin[tile], end = pairs.tile_begin[tile + 1];
+    TileForward t;
+    TileForwardExtra e;
+    unsigned live = start_tile(window, t, static_cast<float>(end - begin));
+    if constexpr (kExtra) {
+        __builtin_memset(&e, 0, sizeof e);
+        for (auto& block : e.median_rank) store(block, splat(-1.0f));
+    }
+    TilePixels pixels;
+    tile_pixels(window.x / kTile, window.y / kTile, pixels);
+
+    for (uint32_t k = begin; k < end && live != 0; ++k) {
+        __builtin_prefetch(&in.splats[pairs.surfel[k + 8 < end ? k + 8 : k]]);
+        unsigned todo = pairs.blocks[k] & live;
+        if (todo == 0) continue;
+        const Splat& s = in.splats[pairs.surfel[k]];
+        F sum_of_weights = splat(0.0f);
+        do {
+            const int block = __builtin_ctz(todo);
+            todo &= todo - 1;
+            const Sample p = sample(s, load(pixels.x[block % 4]), load(pixels.y[block / 4]));
+            const F before = load(t.transmittance[block]);
+            const F after = fnma(before, p.alpha, before);
+            const M blended = both(p.valid, le(splat(kTransmittanceStop), after));
+            const F w = keep(blended, mul(before, p.alpha));
+            const F depth = mul(splat(s.zc), select(p.solid, p.inverse_pz, splat(1.0f)));
+            store(t.r[block], fma(w, splat(s.r), load(t.r[block])));
+            store(t.g[block], fma(w, splat(s.g), load(t.g[block])));
+            store(t.b[block], fma(w, splat(s.b), load(t.b[block])));
+            store(t.depth[block], fma(w, depth, load(t.depth[block])));
+            F kept = select(blended, after, before);
+            accumulate_extra<kExtra>(s, in.normals + pairs.surfel[k], p, blended, w, before, depth,
+                                     splat(static_cast<float>(k - begin)), camera.distortion_scale, e, block);
+            if constexpr (kWeights) sum_of_weights = add(sum_of_weights, w);
+            const M ended = andnot(both(p.valid, lt(splat(0.0f), before)), blended);
+            if (any(ended)) {
+                store(t.stop[block], select(ended, splat(static_cast<float>(k - begin)), load(t.stop[block])));
+                kept = select(ended, neg(before), kept);
+                if (!any(lt(splat(0.0f), kept))) live &= ~(1u << block);
+            }
+            store(t.transmittance[block], kept);
+        } while (todo != 0);
+        if constexpr (kWeights) slot_weights[pairs.slot[k]] = sum(sum_of_weights);
+    }
+
+    alignas(64) float alpha[kBlocksPerTile][kLanes];
+    for (int block = 0; block < kBlocksPerTile; ++block) {
+        const F T = abs(load(t.transmittance[block]));
+        const F A = sub(splat(1.0f), T);
+        store(t.transmittance[block], T);
+        store(alpha[block], A);
+        store(t.depth[block], select(lt(splat(0.0f), A), div(load(t.depth[block]), A), splat(0.0f)));
+    }
+    write_tile(camera, window, &t.r[0][0], out.rgb, 3, 0);
+    write_tile(camera, window, &t.g[0][0], out.rgb, 3, 1);
+    write_tile(camera, window, &t.b[0][0], out.rgb, 3, 2);
+    write_tile(camera, window, &alpha[0][0], out.alpha, 1, 0);
+    write_tile(camera, window, &t.depth[0][0], out.depth, 1, 0);
+    if constexpr (kExtra) {
+        write_tile(camera, window, &e.median[0][0], out.median, 1, 0);
+        write_tile(camera, window, &e.nx[0][0], out.normal, 3, 0);
+        write_tile(camera, window, &e.ny[0][0], out.normal, 3, 1);
+        write_tile(camera, window, &e.nz[0][0], out.normal, 3, 2);
+        write_tile(camera, window, &e.distortion[0][0], out.distortion, 1, 0);
+    }
+    if (state.stop) {
+        write_tile(camera, window, &t.transmittance[0][0], state.transmittance, 1, 0);
+        write_tile(camera, window, &t.stop[0][0], state.stop, 1, 0);
+        if constexpr (kExtra) {
+            write_tile(camera, window, &e.median_rank[0][0], state.median_rank, 1, 0);
+            write_tile(camera, window, &e.q0[0][0], state.moments, 3, 0);
+            write_tile(camera, window, &e.m1[0][0], state.moments, 3, 1);
+            write_tile(camera, window, &e.m2[0][0], state.moments, 3, 2);
+        }
+    }
+}
+
+// An empty tile is zeros; most tiles around a hand are.
+static void clear_tile(const CameraData& camera, const TileWindow& w, float* image, int channels) {
+    if (!image) return;
+    for (int y = 0; y < w.height; ++y) {
+        __builtin_memset(image + (static_cast<int64_t>(w.y + y) * camera.width + w.x) * channels, 0,
+                         static_cast<size_t>(w.width * channels) * sizeof(float));
+    }
+}
+
+void blend(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& out,
+           const PixelState& state, float* slot_weights, int tile) {
+    if (pairs.tile_begin[tile] == pairs.tile_begin[tile + 1]) {
+        const TileWindow w = tile_window(camera, tile);
+        clear_tile(camera, w, out.rgb, 3);
+        clear_tile(camera, w, out.alpha, 1);
+        clear_tile(camera, w, out.depth, 1);
+        clear_tile(camera, w, out.median, 1);
+        clear_tile(camera, w, out.normal, 3);
+        clear_tile(camera, w, out.distortion, 1);
+        return;  // the backward pass skips empty tiles: their pixel state is never read
+    }
+    if (out.normal) {
+        if (slot_weights) {
+            blend_tile<true, true>(camera, in, pairs, out, state, slot_weights, tile);
+        } else {
+            blend_tile<true, false>(camera, in, pairs, out, state, slot_weights, tile);
+        }
+    } else if (slot_weights) {
+        blend_tile<false, true>(camera, in, pairs, out, state, slot_weights, tile);
+    } else {
+        blend_tile<false, false>(camera, in, pairs, out, state, slot_weights, tile);
+    }
+}
+
+}  // namespace mass::MASS_ISA

@@ -1,0 +1,136 @@
+"""tracks.json: the poses of a clip as one readable file, written by every fit and accepted by ``--tracks``."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mass_engine.errors import EngineError
+from mass_engine.hand.pose import HandPose, Side
+
+_ADVICE = "Give a tracks.json as `mass-engine fit` writes it, for the same video."
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """One hand in F frames: ``indices``, ``times`` [F], ``pose`` batched, ``joints3d`` [F,21,3] camera
+    metres, ``landmarks2d`` [F,21,2] pixels, ``scores`` [F]; ``K`` [3,3] for pictures of ``size`` (w, h)."""
+
+    video: str
+    fps: float
+    size: tuple[int, int]
+    K: Tensor
+    indices: list[int]
+    times: list[float]
+    pose: HandPose
+    joints3d: NDArray[np.float32]
+    landmarks2d: NDArray[np.float32]
+    scores: list[float]
+
+
+def write_tracks(tracks: Tracks, path: Path) -> None:
+    """Write tracks.json in one step."""
+    frames = []
+    for row, (index, time) in enumerate(zip(tracks.indices, tracks.times, strict=True)):
+        hand = {
+            "side": tracks.pose.side,
+            "betas": _rounded(tracks.pose.betas[row]),
+            "global_orient": _rounded(tracks.pose.global_orient[row]),
+            "hand_pose": _rounded(tracks.pose.hand_pose[row]),
+            "transl": _rounded(tracks.pose.transl[row]),
+            "joints3d": _rounded(tracks.joints3d[row]),
+            "landmarks2d": _rounded(tracks.landmarks2d[row], 3),
+            "score": round(tracks.scores[row], 4),
+        }
+        frames.append({"index": index, "time": round(time, 6), "hands": [hand]})
+    data = {
+        "video": tracks.video,
+        "fps": round(tracks.fps, 4),
+        "width": tracks.size[0],
+        "height": tracks.size[1],
+        "K": _rounded(tracks.K, 4),
+        "frames": frames,
+    }
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(data) + "\n")
+    os.replace(partial, path)
+
+
+def read_tracks(path: Path, side: str, size: tuple[int, int]) -> Tracks:
+    """Read the hand of ``side`` (auto: the one in most frames) for a video of ``size`` (width, height).
+
+    Raises EngineError ``tracks.not_found``, ``tracks.invalid``, ``tracks.other_video``.
+    """
+    try:
+        data = json.loads(path.read_text())
+    except OSError as error:
+        raise EngineError("tracks.not_found", f"{path} cannot be read.", _ADVICE) from error
+    except ValueError as error:
+        raise EngineError("tracks.invalid", f"{path.name} is not JSON.", _ADVICE) from error
+    try:
+        return _parse(data, side, size)
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise EngineError("tracks.invalid", f"{path.name} is not complete: {error!r}.", _ADVICE) from error
+
+
+def _parse(data: dict[str, Any], side: str, size: tuple[int, int]) -> Tracks:
+    if (int(data["width"]), int(data["height"])) != size:
+        raise EngineError(
+            "tracks.other_video",
+            f"The tracks are for {data['width']}x{data['height']}, the video is {size[0]}x{size[1]}.",
+            _ADVICE,
+        )
+    rows = [(frame, hand) for frame in data["frames"] for hand in frame["hands"]]
+    counts = {name: sum(hand["side"] == name for _, hand in rows) for name in ("left", "right")}
+    chosen = max(counts, key=lambda name: counts[name]) if side == "auto" else side
+    rows = sorted(
+        ((frame, hand) for frame, hand in rows if hand["side"] == chosen), key=lambda row: int(row[0]["index"])
+    )
+    if not rows:
+        raise EngineError("tracks.no_hand", f"The tracks hold no {chosen} hand.", "Choose the other --side.")
+
+    def column(name: str, shape: tuple[int, ...]) -> Tensor:
+        return torch.from_numpy(np.stack([_array(hand[name], shape) for _, hand in rows]))
+
+    return Tracks(
+        str(data["video"]),
+        float(data["fps"]),
+        size,
+        torch.from_numpy(_array(data["K"], (3, 3))),
+        [int(frame["index"]) for frame, _ in rows],
+        [float(frame["time"]) for frame, _ in rows],
+        HandPose(
+            column("betas", (10,)),
+            column("global_orient", (3,)),
+            column("hand_pose", (45,)),
+            column("transl", (3,)),
+            cast("Side", chosen),
+        ),
+        column("joints3d", (21, 3)).numpy(),
+        column("landmarks2d", (21, 2)).numpy(),
+        [min(1.0, max(0.0, float(hand["score"]))) for _, hand in rows],
+    )
+
+
+def _array(value: object, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    array = np.asarray(value, dtype=np.float32)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"expected finite numbers of shape {shape}, not {array.shape}")
+    return array
+
+
+def _rounded(value: Tensor | NDArray[np.float32] | Sequence[float], digits: int = 6) -> Any:
+    array = np.asarray(value, dtype=np.float64)
+    if not math.isfinite(float(np.abs(array).sum())):
+        raise ValueError("tracks hold numbers that are not finite")
+    return np.round(array, digits).tolist()

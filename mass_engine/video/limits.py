@@ -1,0 +1,15 @@
+"""How much video one job may bring; headers lie, so every cap is also enforced while decoding."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class VideoLimits:
+    """Caps on one file: size in bytes, pixels of one frame, decoded frames, seconds from first to last frame."""
+
+    max_bytes: int = 2_000_000_000
+    max_pixels: int = 4096 * 2304
+    max_frames: int = 18_000
+    max_seconds: float = 600.0

@@ -1,0 +1,285 @@
+"""A small client of the HTTP API: submit a video, follow the job, render, download."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+from urllib.parse import quote
+
+import httpx
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+FINAL = frozenset({"succeeded", "failed", "cancelled"})
+
+#: Told how many bytes of how many have been sent or received.
+BytesProgress = Callable[[int, int], None]
+
+
+class ServiceError(Exception):
+    """The service refused or could not be reached: status (0: not reached), stable code, text, advice."""
+
+    def __init__(self, status: int, code: str, message: str, advice: str = "") -> None:
+        super().__init__(f"{message} {advice}".strip())
+        self.status, self.code, self.message, self.advice = status, code, message, advice
+
+
+@dataclass(frozen=True)
+class JobError:
+    """Why a job failed."""
+
+    code: str
+    message: str
+    advice: str
+
+
+@dataclass(frozen=True)
+class JobInfo:
+    """A job as the service described it; ``fraction`` from 0 to 1, ``time_left`` in seconds or unknown."""
+
+    id: str
+    state: str
+    stage: str | None
+    fraction: float
+    time_left: float | None
+    message: str
+    attempt: int
+    error: JobError | None
+    created_at: str
+
+    @property
+    def finished(self) -> bool:
+        """Whether the state is final."""
+        return self.state in FINAL
+
+
+@dataclass(frozen=True)
+class AssetInfo:
+    """A file of a finished job."""
+
+    name: str
+    bytes: int
+    sha256: str
+
+
+class MassClient:
+    """Talks to one service. Every method raises ServiceError."""
+
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        timeout: float = 60.0,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self._http = httpx.Client(base_url=url, timeout=timeout, transport=transport)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def submit(
+        self,
+        video: Path,
+        options: Mapping[str, Any] | None = None,
+        on_progress: BytesProgress | None = None,
+    ) -> JobInfo:
+        """Upload a video and create its job. Raises OSError when the file cannot be read."""
+        with video.open("rb") as file:
+            stream: Any = file if on_progress is None else _Counted(file, video.stat().st_size, on_progress)
+            return _job(
+                self._request(
+                    "POST",
+                    "/jobs",
+                    # The name on this machine is nobody else's business.
+                    files={"video": ("video", stream, "application/octet-stream")},
+                    data={"options": json.dumps(dict(options))} if options else None,
+                ).json()
+            )
+
+    def job(self, job_id: str) -> JobInfo:
+        """The job as it is now."""
+        return _job(self._request("GET", _path(job_id)).json())
+
+    def jobs(self) -> Iterator[JobInfo]:
+        """All jobs, newest first."""
+        cursor: str | None = None
+        while True:
+            page = self._request("GET", "/jobs", params={} if cursor is None else {"cursor": cursor}).json()
+            yield from map(_job, page["jobs"])
+            cursor = page["next"]
+            if cursor is None:
+                return
+
+    def wait(
+        self,
+        job_id: str,
+        on_update: Callable[[JobInfo], None] | None = None,
+        poll_seconds: float = 1.0,
+        patience: float = 60.0,
+    ) -> JobInfo:
+        """Follow the job to its end. A service that is away is waited for, ``patience`` seconds long."""
+        etag, job = "", None
+        last_answer = time.monotonic()
+        while job is None or not job.finished:
+            if job is not None or etag:
+                time.sleep(poll_seconds)
+            try:
+                response = self._request(
+                    "GET", _path(job_id), headers={"If-None-Match": etag} if etag else {}
+                )
+            except ServiceError as error:
+                away = error.status == 0 or error.status >= 500
+                if not away or time.monotonic() - last_answer > patience:
+                    raise
+                time.sleep(poll_seconds)
+                continue
+            last_answer = time.monotonic()
+            if response.status_code == 304:
+                continue
+            etag, job = response.headers.get("etag", ""), _job(response.json())
+            if on_update is not None:
+                on_update(job)
+        return job
+
+    def cancel(self, job_id: str) -> JobInfo:
+        """Stop a queued or running job."""
+        return _job(self._request("POST", f"{_path(job_id)}/cancel").json())
+
+    def delete(self, job_id: str) -> None:
+        """Remove the job and everything of it."""
+        self._request("DELETE", _path(job_id))
+
+    def render(
+        self,
+        job_id: str,
+        pose: str = "rest",
+        camera: str = "source",
+        width: int = 512,
+        height: int = 512,
+        image_format: str = "png",
+    ) -> bytes:
+        """An encoded picture (``png``, ``jpeg`` or ``webp``) of the finished hand."""
+        query = {"pose": pose, "camera": camera, "width": width, "height": height, "format": image_format}
+        return self._request("GET", f"{_path(job_id)}/render", params=query).content
+
+    def assets(self, job_id: str) -> list[AssetInfo]:
+        """The files of a finished job."""
+        found = self._request("GET", f"{_path(job_id)}/assets").json()["assets"]
+        return [AssetInfo(entry["name"], entry["bytes"], entry["sha256"]) for entry in found]
+
+    def download(
+        self, job_id: str, asset: AssetInfo, folder: Path, on_progress: BytesProgress | None = None
+    ) -> Path:
+        """Write an asset below ``folder``, checked against its SHA-256; returns the file."""
+        target = folder / asset.name
+        if not target.resolve().is_relative_to(folder.resolve()):
+            raise ServiceError(0, "client.name", f"The service sent the unusable file name {asset.name!r}.")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part = target.with_name(f"{target.name}.part")
+        digest, received = hashlib.sha256(), 0
+        try:
+            with (
+                self._http.stream("GET", f"{_path(job_id)}/assets/{quote(asset.name)}") as response,
+                part.open("wb") as file,
+            ):
+                if response.is_error:
+                    response.read()
+                    raise _refusal(response)
+                for chunk in response.iter_bytes():
+                    file.write(chunk)
+                    digest.update(chunk)
+                    received += len(chunk)
+                    if on_progress is not None:
+                        on_progress(received, asset.bytes)
+            if digest.hexdigest() != asset.sha256:
+                raise ServiceError(
+                    0, "client.checksum", f"{asset.name} arrived damaged.", "Download it again."
+                )
+            part.replace(target)
+        except httpx.HTTPError as error:
+            raise self._unreachable(error) from error
+        finally:
+            part.unlink(missing_ok=True)
+        return target
+
+    def _request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
+        try:
+            response = self._http.request(method, path, **arguments)
+        except httpx.HTTPError as error:
+            raise self._unreachable(error) from error
+        if response.is_error:
+            raise _refusal(response)
+        return response
+
+    def _unreachable(self, error: httpx.HTTPError) -> ServiceError:
+        return ServiceError(
+            0,
+            "client.unreachable",
+            f"The service at {self._http.base_url} does not answer ({error or type(error).__name__}).",
+            "Start it with `mass serve`, or name another with --url.",
+        )
+
+
+class _Counted:
+    """A file that tells how much of it was read."""
+
+    def __init__(self, file: IO[bytes], total: int, tell: BytesProgress) -> None:
+        self._file, self._total, self._tell, self._sent = file, total, tell, 0
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._file.read(size)
+        self._sent += len(data)
+        self._tell(self._sent, self._total)
+        return data
+
+    def fileno(self) -> int:
+        return self._file.fileno()  # its size is taken from here
+
+
+def _path(job_id: str) -> str:
+    return f"/jobs/{quote(job_id, safe='')}"
+
+
+def _refusal(response: httpx.Response) -> ServiceError:
+    try:
+        body = response.json()
+    except ValueError:
+        body = {}
+    if not isinstance(body, dict):
+        body = {}
+    message = body.get("detail") or body.get("title") or f"The service answered {response.status_code}."
+    faults = [f"{error.get('field')}: {error.get('message')}" for error in body.get("errors") or []]
+    return ServiceError(
+        response.status_code,
+        body.get("code", f"http.{response.status_code}"),
+        "; ".join([message, *faults]),
+        body.get("advice", ""),
+    )
+
+
+def _job(body: Mapping[str, Any]) -> JobInfo:
+    error = body.get("error")
+    return JobInfo(
+        id=body["id"],
+        state=body["state"],
+        stage=body["stage"],
+        fraction=body["fraction"],
+        time_left=body["time_left"],
+        message=body["message"],
+        attempt=body["attempt"],
+        error=None if error is None else JobError(error["code"], error["message"], error["advice"]),
+        created_at=body["created_at"],
+    )

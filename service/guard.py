@@ -1,0 +1,84 @@
+"""What every request and response passes: Host and Origin checks, and protective headers."""
+
+from __future__ import annotations
+
+import ipaddress
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.problems import Kind, ProblemError, ProblemResponse
+
+_SAFE = {"GET", "HEAD", "OPTIONS"}
+_PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+#: The interactive documentation loads its viewer from a CDN and starts it inline.
+_DOCS_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' https://cdn.jsdelivr.net; "
+    "style-src 'unsafe-inline' https://cdn.jsdelivr.net; img-src 'self' data: https://fastapi.tiangolo.com; "
+    "connect-src 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+
+
+class Guard:
+    """ASGI middleware. ``hosts`` are the names answered to besides IP addresses and ``localhost``.
+
+    A page of another site can make a browser talk to a service on the user's own machine: under a name that
+    it rebinds (hence the Host check; rebinding needs a name, so addresses are safe), or by a plain form post
+    (hence the Origin check).
+    """
+
+    def __init__(self, app: ASGIApp, hosts: frozenset[str]) -> None:
+        self._app = app
+        self._hosts = hosts | {"localhost"}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Check, then pass on."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        policy = _DOCS_POLICY if scope["path"] == "/docs" else _PAGE_POLICY
+
+        async def protected(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                out = MutableHeaders(scope=message)
+                out.setdefault("x-content-type-options", "nosniff")
+                out.setdefault("referrer-policy", "no-referrer")
+                out.setdefault("content-security-policy", policy)
+                out.setdefault("cross-origin-resource-policy", "same-origin")
+            await send(message)
+
+        kind = self._refusal(scope["method"], headers)
+        if kind is None:
+            await self._app(scope, receive, protected)
+        else:
+            problem = ProblemError(kind)
+            problem.unread = "content-length" in headers or "transfer-encoding" in headers
+            await ProblemResponse(Request(scope), problem)(scope, receive, protected)
+
+    def _refusal(self, method: str, headers: Headers) -> Kind | None:
+        host = headers.get("host", "")
+        if "*" not in self._hosts and not self._known(host):
+            return Kind.REQUEST_HOST
+        origin = headers.get("origin")
+        if method not in _SAFE and origin is not None and urlsplit(origin).netloc != host:
+            return Kind.REQUEST_ORIGIN
+        return None
+
+    def _known(self, host: str) -> bool:
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        if name in self._hosts:
+            return True
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return True

@@ -1,0 +1,116 @@
+"""What a job is: its states, the transitions allowed between them, and its row."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+import uuid
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import JSON, Enum, Index, String, Text
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+
+class JobState(StrEnum):
+    """Where a job stands. Later: awaiting_upload and cancelling before the end, expired at the end."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+#: The one table of allowed moves. ``running -> running`` is a second worker taking over an expired lease.
+TRANSITIONS: dict[JobState, frozenset[JobState]] = {
+    JobState.QUEUED: frozenset({JobState.RUNNING, JobState.CANCELLED}),
+    JobState.RUNNING: frozenset(
+        {JobState.RUNNING, JobState.QUEUED, JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED}
+    ),
+    JobState.SUCCEEDED: frozenset(),
+    JobState.FAILED: frozenset(),
+    JobState.CANCELLED: frozenset(),
+}
+
+FINAL_STATES: frozenset[JobState] = frozenset(state for state, after in TRANSITIONS.items() if not after)
+
+
+def sources(target: JobState) -> frozenset[JobState]:
+    """The states from which ``target`` may be entered."""
+    return frozenset(state for state, after in TRANSITIONS.items() if target in after)
+
+
+_JOB_ID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-7[0-9a-f]{3}-[89ab][0-9a-f]{3}-[0-9a-f]{12}")
+
+
+def new_job_id(now: float | None = None) -> str:
+    """A UUID of version 7: ids sort by creation time and carry 74 random bits nobody can guess."""
+    milliseconds = int((time.time() if now is None else now) * 1000) & (1 << 48) - 1
+    bits = milliseconds << 80 | int.from_bytes(os.urandom(10), "big")
+    bits = bits & ~(0xF << 76) | 7 << 76
+    bits = bits & ~(0x3 << 62) | 2 << 62
+    return str(uuid.UUID(int=bits))
+
+
+def is_job_id(text: str) -> bool:
+    """Whether ``text`` has exactly the form of an id made here (nothing else ever reaches a path)."""
+    return _JOB_ID.fullmatch(text) is not None
+
+
+class Base(DeclarativeBase):
+    """The declarative base of every table."""
+
+
+#: Stored as plain text, so that a new state needs no change of the database.
+_STATE = Enum(
+    JobState, native_enum=False, length=20, values_callable=lambda states: [state.value for state in states]
+)
+
+
+class Job(Base):
+    """One reconstruction. The row is the truth; broker messages are only hints. Times: seconds since 1970."""
+
+    __tablename__ = "jobs"
+    __table_args__ = (
+        Index("ix_jobs_state_lease", "state", "lease_until"),
+        Index("ix_jobs_state_publish", "state", "publish_due_at"),
+    )
+
+    id: Mapped[str] = mapped_column(String(36), primary_key=True)
+    state: Mapped[JobState] = mapped_column(_STATE, default=JobState.QUEUED)
+    #: What the engine does now and how far the whole job is (0 to 1, never falling within one attempt).
+    stage: Mapped[str | None] = mapped_column(String(40), default=None)
+    fraction: Mapped[float] = mapped_column(default=0.0)
+    time_left: Mapped[float | None] = mapped_column(default=None)
+    message: Mapped[str] = mapped_column(Text, default="")
+
+    options: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
+    #: The uploaded video, relative to the data directory; no name chosen by a client appears in it.
+    video: Mapped[str] = mapped_column(String(200))
+    video_bytes: Mapped[int | None] = mapped_column(default=None)
+
+    error_code: Mapped[str | None] = mapped_column(String(80), default=None)
+    error_message: Mapped[str | None] = mapped_column(Text, default=None)
+    error_advice: Mapped[str | None] = mapped_column(Text, default=None)
+
+    #: The lease: who works on it (a fencing token, new for each claim), which try it is, until when.
+    attempt: Mapped[int] = mapped_column(default=0)
+    token: Mapped[str | None] = mapped_column(String(32), default=None)
+    lease_until: Mapped[float | None] = mapped_column(default=None)
+    cancel_requested: Mapped[bool] = mapped_column(default=False)
+    #: Set by DELETE: the job is invisible from then on, its bytes go as soon as no worker holds it.
+    deleted_at: Mapped[float | None] = mapped_column(default=None)
+
+    created_at: Mapped[float]
+    started_at: Mapped[float | None] = mapped_column(default=None)
+    finished_at: Mapped[float | None] = mapped_column(default=None)
+
+    #: Outbox: when the wake-up message was last sent, how often, and when it is due again.
+    last_published_at: Mapped[float | None] = mapped_column(default=None)
+    publish_attempts: Mapped[int] = mapped_column(default=0)
+    publish_due_at: Mapped[float] = mapped_column(default=0.0)
+
+    #: Name of the published artifact directory (``<attempt>-<token>``), set only on success.
+    artifact: Mapped[str | None] = mapped_column(String(60), default=None)

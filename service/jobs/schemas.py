@@ -1,0 +1,133 @@
+"""What goes in and out of the API about jobs."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.jobs.model import FINAL_STATES, Job, JobState
+
+
+class JobOptions(BaseModel):
+    """How to reconstruct; the names and meanings are those of the engine's command line."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    side: Literal["auto", "left", "right"] = Field(default="auto", description="Which hand to reconstruct.")
+    preset: Literal["draft", "auto", "full"] = Field(
+        default="auto", description="How much time to spend on quality."
+    )
+    seed: int = Field(default=0, ge=0, lt=2**31, description="Same seed, same machine: same result.")
+    fov: float | None = Field(
+        default=None,
+        gt=10,
+        lt=150,
+        allow_inf_nan=False,
+        description="Field of view across the longer image side, degrees; absent: the engine assumes one.",
+    )
+    max_frames: int | None = Field(
+        default=None, ge=2, le=100_000, description="Use at most this many frames."
+    )
+    holdout: int | None = Field(
+        default=None,
+        ge=2,
+        le=1000,
+        description="Keep every n-th frame out of the fit and measure quality on it.",
+    )
+
+
+class ErrorView(BaseModel):
+    """Why a job failed."""
+
+    code: str = Field(examples=["video.no_hand"])
+    message: str
+    advice: str
+
+
+class Links(BaseModel):
+    """Where to go from here; absent what the job's state does not allow yet."""
+
+    self: str
+    cancel: str | None = None
+    render: str | None = None
+    assets: str | None = None
+
+
+class JobView(BaseModel):
+    """One job."""
+
+    id: str
+    state: JobState
+    cancel_requested: bool = Field(description="A running job that is being stopped.")
+    stage: str | None = Field(description="What the engine does now: read, track, segment, align, ...")
+    fraction: float = Field(ge=0, le=1, description="Of the whole job; never falls within one attempt.")
+    time_left: float | None = Field(description="Seconds, as the engine estimates it.")
+    message: str
+    attempt: int = Field(description="Which try this is; a try lost to a crash is repeated.")
+    options: JobOptions
+    video_bytes: int | None
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    error: ErrorView | None
+    links: Links
+
+
+class JobPage(BaseModel):
+    """Some jobs, newest first."""
+
+    jobs: list[JobView]
+    next: str | None = Field(description="Pass as `cursor` for the page after this one; null on the last.")
+
+
+class AssetView(BaseModel):
+    """One file of a finished job."""
+
+    name: str
+    bytes: int
+    sha256: str
+    media_type: str
+    href: str
+
+
+class AssetList(BaseModel):
+    """The files of a finished job."""
+
+    assets: list[AssetView]
+
+
+def job_view(job: Job) -> JobView:
+    """The public side of a row."""
+    path = f"/jobs/{job.id}"
+    done = job.state == JobState.SUCCEEDED
+    error = None
+    if job.error_code is not None:
+        error = ErrorView(code=job.error_code, message=job.error_message or "", advice=job.error_advice or "")
+    return JobView(
+        id=job.id,
+        state=job.state,
+        cancel_requested=job.cancel_requested and job.state == JobState.RUNNING,
+        stage=job.stage,
+        fraction=job.fraction,
+        time_left=job.time_left,
+        message=job.message,
+        attempt=job.attempt,
+        options=JobOptions.model_validate(job.options),
+        video_bytes=job.video_bytes,
+        created_at=_moment(job.created_at),
+        started_at=None if job.started_at is None else _moment(job.started_at),
+        finished_at=None if job.finished_at is None else _moment(job.finished_at),
+        error=error,
+        links=Links(
+            self=path,
+            cancel=None if job.state in FINAL_STATES else f"{path}/cancel",
+            render=f"{path}/render" if done else None,
+            assets=f"{path}/assets" if done else None,
+        ),
+    )
+
+
+def _moment(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)

@@ -1,0 +1,81 @@
+"""Pictures of a finished hand in any pose, from any side."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+
+from service.pictures import MAX_SIDE, MIN_SIDE, PictureFormat, canonical_view
+from service.problems import Kind, declared
+from service.routes.jobs import JobId
+from service.services import ServicesDep, not_modified
+
+router = APIRouter(prefix="/jobs", tags=["results"])
+
+Side = Annotated[int, Query(ge=MIN_SIDE, le=MAX_SIDE, description="Pixels.")]
+
+
+@router.get(
+    "/{job_id}/render",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "The picture. PNG and WebP have straight alpha; JPEG shows the hand on white.",
+            "content": {
+                f"image/{name}": {"schema": {"type": "string", "contentMediaType": f"image/{name}"}}
+                for name in ("png", "jpeg", "webp")
+            },
+        },
+        304: {"description": "Unchanged since the ETag sent."},
+        **declared(
+            Kind.JOB_NOT_FOUND,
+            Kind.JOB_NOT_READY,
+            Kind.JOB_NO_RESULT,
+            Kind.REQUEST_INVALID,
+            Kind.POSE_INVALID,
+            Kind.CAMERA_INVALID,
+            Kind.RENDER_TOO_LARGE,
+            Kind.RENDER_REFUSED,
+            Kind.RENDER_FAILED,
+            Kind.RENDER_BUSY,
+            Kind.RENDER_TIMEOUT,
+        ),
+    },
+)
+def render_job(
+    job_id: JobId,
+    request: Request,
+    services: ServicesDep,
+    pose: Annotated[
+        str,
+        Query(
+            max_length=2000,
+            description="`rest`, `fist`, `point`, `pinch`, `spread`, `frame:N`, or 48 comma-separated angles "
+            "in radians: the axis-angle of the wrist, then of the 15 joints.",
+        ),
+    ] = "rest",
+    camera: Annotated[
+        str,
+        Query(
+            max_length=200,
+            description="`source` (the camera of the video), or `orbit:YAW,PITCH` around the hand in degrees, "
+            "at a distance that fits it into the picture; `orbit:YAW,PITCH,DISTANCE` names it in metres.",
+        ),
+    ] = "orbit:0,0",
+    width: Side = 512,
+    height: Side = 512,
+    format: Annotated[PictureFormat, Query()] = "png",
+) -> Response:
+    """Render the hand. Repeated requests are answered from a cache; use `If-None-Match`."""
+    artifact = services.artifact(job_id)
+    view = canonical_view(pose, camera, width, height, format, services.settings.max_render_pixels)
+    headers = {"ETag": view.etag(job_id, artifact), "Cache-Control": "private, no-cache"}
+    if not_modified(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    picture = services.pictures.get(job_id, artifact, view)
+    if picture is None:
+        avatar = services.storage.artifact_path(job_id, artifact) / "avatar.safetensors"
+        picture = services.pool.render(avatar, view)
+        services.pictures.put(job_id, artifact, view, picture)
+    return Response(picture, media_type=view.media_type, headers=headers)

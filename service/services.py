@@ -1,0 +1,76 @@
+"""What the routes work with, made once per app and closed with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Annotated, cast
+
+from fastapi import Depends, Request
+
+from service.jobs.model import Job, JobState, is_job_id
+from service.jobs.store import JobStore, create_store
+from service.pictures import PictureCache
+from service.problems import Kind, ProblemError
+from service.queue import JobQueue, create_queue
+from service.rendering import Loader, RenderPool, create_pool
+from service.settings import Settings
+from service.storage import Storage, create_storage
+
+
+@dataclass(frozen=True)
+class Services:
+    """Everything behind the routes."""
+
+    settings: Settings
+    store: JobStore
+    storage: Storage
+    queue: JobQueue
+    pool: RenderPool
+    pictures: PictureCache
+
+    def job(self, job_id: str) -> Job:
+        """The job. Raises ProblemError (404)."""
+        job = self.store.get(job_id) if is_job_id(job_id) else None
+        if job is None:
+            raise ProblemError(Kind.JOB_NOT_FOUND)
+        return job
+
+    def artifact(self, job_id: str) -> str:
+        """The name of the job's result directory. Raises ProblemError (404, 409)."""
+        job = self.job(job_id)
+        if job.state == JobState.SUCCEEDED and job.artifact is not None:
+            return job.artifact
+        if job.state in (JobState.FAILED, JobState.CANCELLED):
+            raise ProblemError(Kind.JOB_NO_RESULT, f"The job is {job.state}.")
+        raise ProblemError(Kind.JOB_NOT_READY, f"The job is {job.state}.", headers={"Retry-After": "5"})
+
+
+@contextmanager
+def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
+    """Open all of it; close all of it, also when opening fails half way."""
+    with ExitStack() as stack:
+        store = create_store(settings)
+        stack.callback(store.close)
+        storage = create_storage(settings)
+        queue = create_queue(settings)
+        stack.callback(queue.close)
+        pool = create_pool(settings, loader)
+        stack.callback(pool.close)
+        pool.start()
+        yield Services(settings, store, storage, queue, pool, PictureCache(settings.render_cache_bytes))
+
+
+async def _services(request: Request) -> Services:
+    return cast(Services, request.app.state.services)
+
+
+ServicesDep = Annotated[Services, Depends(_services)]
+
+
+def not_modified(request: Request, etag: str) -> bool:
+    """Whether the client holds this version already (If-None-Match, compared weakly)."""
+    header = request.headers.get("if-none-match", "")
+    held = {part.strip().removeprefix("W/") for part in header.split(",")}
+    return header.strip() == "*" or etag.removeprefix("W/") in held

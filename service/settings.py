@@ -1,0 +1,72 @@
+"""Configuration: one object made from the environment (``MASS_*``) and handed to whoever needs it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from pydantic import Field, field_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+GIB = 1024**3
+
+
+class Settings(BaseSettings):
+    """Everything that can be set. Times are seconds, sizes bytes. There is no module-level instance."""
+
+    model_config = SettingsConfigDict(env_prefix="MASS_", extra="ignore")
+
+    data_dir: Path = Path("data")
+    #: SQLAlchemy URL of the job database; empty means a SQLite file in ``data_dir``.
+    database_url: str = ""
+    #: Broker; None means the embedded one (see ``broker_url`` in service/queue.py).
+    redis_url: str | None = None
+    queue_name: str = "mass"
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=8000, ge=0, le=65535)
+    #: Host headers answered to, besides loopback names and ``host``. "*" accepts any.
+    allowed_hosts: list[str] = Field(default_factory=list)
+
+    max_upload_bytes: int = Field(default=2 * GIB, gt=0)
+    max_video_seconds: float = Field(default=600.0, gt=0)
+    #: Below this much free space no upload is accepted (507).
+    min_free_bytes: int = Field(default=GIB, ge=0)
+    #: An upload without a job that nobody wrote to for this long is removed.
+    orphan_upload_seconds: float = Field(default=3600.0, gt=0)
+
+    lease_seconds: float = Field(default=60.0, gt=0)
+    heartbeat_seconds: float = Field(default=10.0, gt=0)
+    max_attempts: int = Field(default=3, ge=1)
+    reconcile_seconds: float = Field(default=10.0, gt=0)
+    republish_min_seconds: float = Field(default=60.0, gt=0)
+    republish_max_seconds: float = Field(default=600.0, gt=0)
+    job_timeout: float = Field(default=2 * 3600.0, gt=0)
+
+    render_workers: int = Field(default=1, ge=1)
+    render_timeout: float = Field(default=10.0, gt=0)
+    #: The first picture of a job loads the avatar (and, in a fresh process, the engine itself).
+    render_load_timeout: float = Field(default=60.0, gt=0)
+    #: Requests that may wait for a render process; one more is answered 503.
+    render_queue: int = Field(default=16, ge=0)
+    render_warm_avatars: int = Field(default=4, ge=1)
+    render_cache_bytes: int = Field(default=64 * 1024**2, ge=0)
+    max_render_pixels: int = Field(default=2048 * 2048, gt=0)
+
+    #: The engine's command line; tests put another program here.
+    engine_command: list[str] | None = None
+
+    @field_validator("data_dir")
+    @classmethod
+    def _absolute(cls, value: Path) -> Path:
+        return value.expanduser().absolute()
+
+    @property
+    def database(self) -> str:
+        """The SQLAlchemy URL in force."""
+        return self.database_url or f"sqlite:///{self.data_dir / 'mass.sqlite3'}"
+
+    @property
+    def engine(self) -> list[str]:
+        """The command that starts the engine, without its arguments."""
+        return self.engine_command or [sys.executable, "-m", "mass_engine"]

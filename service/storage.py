@@ -1,0 +1,198 @@
+"""Files of jobs on a local disk. Every name in a path is chosen here or comes from a fixed list.
+
+    uploads/<job>/source            the video (``source.part`` until it is complete)
+    jobs/<job>/<attempt>-<token>/   one attempt's output; the row names the one that counts
+
+An attempt's directory is written by one worker only, and becomes the job's result when the row says so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import stat
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from service.jobs.model import is_job_id
+from service.settings import Settings
+
+#: Assets that may be served, with their media types; and the pattern of preview pictures.
+ASSET_TYPES: dict[str, str] = {
+    "avatar.safetensors": "application/octet-stream",
+    "report.json": "application/json",
+    "tracks.json": "application/json",
+    "surfels.ply": "application/octet-stream",
+}
+_PREVIEW = re.compile(r"previews/[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(png|jpg|webp)")
+_PREVIEW_TYPES = {"png": "image/png", "jpg": "image/jpeg", "webp": "image/webp"}
+_ARTIFACT = re.compile(r"[0-9]{1,6}-[0-9a-zA-Z]{1,64}")
+_MANIFEST = "assets.json"
+
+
+@dataclass(frozen=True)
+class Asset:
+    """One downloadable file of a finished job."""
+
+    name: str
+    bytes: int
+    sha256: str
+    media_type: str
+
+
+def media_type(name: str) -> str | None:
+    """The media type of an asset that may be served; None for every other name."""
+    if _PREVIEW.fullmatch(name):
+        return _PREVIEW_TYPES[name.rsplit(".", 1)[1]]
+    return ASSET_TYPES.get(name)
+
+
+class Storage:
+    """The data directory. Wrong ids or names raise ValueError: they are bugs, not user errors."""
+
+    def __init__(self, data_dir: Path, min_free_bytes: int = 0) -> None:
+        self.root = data_dir
+        self._min_free = min_free_bytes
+        self._uploads = data_dir / "uploads"
+        self._jobs = data_dir / "jobs"
+        for folder in (self._uploads, self._jobs):
+            folder.mkdir(parents=True, exist_ok=True, mode=0o750)
+
+    def free_bytes(self) -> int:
+        """Bytes an unprivileged process may still write."""
+        return shutil.disk_usage(self.root).free
+
+    def has_room(self, incoming: int = 0) -> bool:
+        """Whether ``incoming`` bytes fit and leave the reserve untouched."""
+        return self.free_bytes() - incoming >= self._min_free
+
+    # Uploads
+
+    def begin_upload(self, job_id: str) -> Path:
+        """Create the job's upload directory; returns the file to write."""
+        folder = self._uploads / _checked(job_id)
+        folder.mkdir(mode=0o750)
+        return folder / "source.part"
+
+    def finish_upload(self, job_id: str) -> str:
+        """Make the written file durable and give it its name; returns the reference kept in the row."""
+        part = self._uploads / _checked(job_id) / "source.part"
+        _fsync(part)
+        source = part.with_name("source")
+        part.rename(source)
+        _fsync(source.parent)
+        _fsync(self._uploads)
+        return str(source.relative_to(self.root))
+
+    def discard_upload(self, job_id: str) -> None:
+        """Forget an upload, complete or not."""
+        shutil.rmtree(self._uploads / _checked(job_id), ignore_errors=True)
+
+    def source(self, reference: str) -> Path:
+        """The video a row refers to (``Job.video``)."""
+        path = self.root / reference
+        if path.parent.parent != self._uploads or path.name != "source" or not is_job_id(path.parent.name):
+            raise ValueError(f"not an upload: {reference!r}")
+        return path
+
+    def idle_uploads(self, older_than: float) -> Iterator[str]:
+        """Ids of upload directories nobody wrote to for ``older_than`` seconds."""
+        limit = time.time() - older_than
+        for folder in self._uploads.iterdir():
+            times = [entry.stat().st_mtime for entry in (folder, *folder.glob("*")) if entry.exists()]
+            if is_job_id(folder.name) and max(times, default=0.0) < limit:
+                yield folder.name
+
+    # Results
+
+    def attempt_dir(self, job_id: str, artifact: str) -> Path:
+        """Create and return the directory for one attempt's output (``Claim.artifact``)."""
+        path = self._artifact(job_id, artifact)
+        path.mkdir(parents=True, exist_ok=True, mode=0o750)
+        return path
+
+    def artifact_path(self, job_id: str, artifact: str) -> Path:
+        """The directory of a published result."""
+        return self._artifact(job_id, artifact)
+
+    def publish(self, job_id: str, artifact: str) -> list[Asset]:
+        """Hash the files, write the list of assets and make all of it durable.
+
+        Call before the row is flipped with ``JobStore.succeed``. Links and unknown names are left out.
+        """
+        folder = self._artifact(job_id, artifact)
+        assets = []
+        for path in sorted(folder.rglob("*")):
+            name = path.relative_to(folder).as_posix()
+            kind = media_type(name)
+            if kind is not None and stat.S_ISREG(path.lstat().st_mode):
+                assets.append(Asset(name, path.stat().st_size, _sha256(path), kind))
+                _fsync(path)
+        manifest = folder / _MANIFEST
+        manifest.write_text(json.dumps([asdict(asset) for asset in assets]))
+        for path in (manifest, *(p for p in (folder / "previews",) if p.is_dir()), folder, folder.parent):
+            _fsync(path)
+        _fsync(self._jobs)
+        return assets
+
+    def assets(self, job_id: str, artifact: str) -> list[Asset]:
+        """What :meth:`publish` listed."""
+        manifest = self._artifact(job_id, artifact) / _MANIFEST
+        return [Asset(**entry) for entry in json.loads(manifest.read_text())]
+
+    def open_asset(self, job_id: str, artifact: str, name: str) -> tuple[Asset, Path] | None:
+        """An asset and its file; None for a name that was not published or is not a plain file now."""
+        if media_type(name) is None:
+            return None
+        found = next((asset for asset in self.assets(job_id, artifact) if asset.name == name), None)
+        path = self._artifact(job_id, artifact) / name
+        if found is None or path.parent.is_symlink() or not stat.S_ISREG(path.lstat().st_mode):
+            return None
+        return found, path
+
+    def drop_attempts(self, job_id: str, keep: str | None = None) -> None:
+        """Remove the output of every attempt except ``keep``."""
+        folder = self._jobs / _checked(job_id)
+        for path in folder.iterdir() if folder.is_dir() else ():
+            if path.name != keep:
+                shutil.rmtree(path, ignore_errors=True)
+
+    def delete_job(self, job_id: str) -> None:
+        """Remove every byte of the job. Raises OSError when something could not be removed."""
+        for folder in (self._uploads / _checked(job_id), self._jobs / job_id):
+            if folder.exists():
+                shutil.rmtree(folder)
+
+    def _artifact(self, job_id: str, artifact: str) -> Path:
+        if _ARTIFACT.fullmatch(artifact) is None:
+            raise ValueError(f"not an artifact: {artifact!r}")
+        return self._jobs / _checked(job_id) / artifact
+
+
+def create_storage(settings: Settings) -> Storage:
+    """The storage of ``settings``."""
+    return Storage(settings.data_dir, settings.min_free_bytes)
+
+
+def _checked(job_id: str) -> str:
+    if not is_job_id(job_id):
+        raise ValueError(f"not a job id: {job_id!r}")
+    return job_id
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _fsync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

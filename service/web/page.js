@@ -1,0 +1,126 @@
+// The page: send a video, watch the job, look at the hand. Everything shown goes in as text, never as markup.
+const $ = (id) => document.getElementById(id);
+const POSES = ["rest", "fist", "point", "pinch", "spread"];
+let current = null; // id of the job shown
+let pose = "rest";
+let timer = 0;
+
+const show = (id, on) => { $(id).hidden = !on; };
+const minutes = (s) => (s < 90 ? `${Math.ceil(s)} s` : `${Math.ceil(s / 60)} min`);
+
+function complain(problem) {
+  show("problem", Boolean(problem));
+  if (problem) $("problem").textContent = `${problem.detail || problem.message} ${problem.advice || ""}`;
+}
+
+async function call(path, options) {
+  const answer = await fetch(path, options);
+  const body = answer.status === 204 ? null : await answer.json();
+  if (!answer.ok) throw body;
+  return body;
+}
+
+function row(text, href, note) {
+  const item = document.createElement("li");
+  const link = Object.assign(document.createElement("a"), { href, textContent: text });
+  item.append(link, Object.assign(document.createElement("small"), { textContent: note }));
+  return item;
+}
+
+async function send(file) {
+  const limits = await call("/capabilities");
+  if (file.size > limits.max_upload_bytes) {
+    return complain({ detail: "This file is too large.", advice: "Send a shorter video." });
+  }
+  complain(null);
+  const form = new FormData();
+  form.append("video", file);
+  const request = new XMLHttpRequest(); // fetch cannot report how much was sent
+  request.responseType = "json";
+  request.upload.onprogress = (event) => progress("uploading", event.loaded / event.total, null, "");
+  request.onerror = () => complain({ detail: "The connection broke.", advice: "Send the video again." });
+  request.onload = () => (request.status === 202 ? watch(request.response.id) : complain(request.response));
+  request.open("POST", "/jobs");
+  request.send(form);
+  show("result", false);
+  progress("uploading", 0, null, "");
+}
+
+function progress(state, fraction, left, message) {
+  show("job", true);
+  $("state").textContent = `${state} · ${Math.round(fraction * 100)} %`;
+  $("left").textContent = left === null ? "" : `about ${minutes(left)} left`;
+  $("bar").value = fraction;
+  $("message").textContent = message;
+  show("cancel", false);
+  show("delete", false);
+}
+
+async function watch(id) {
+  clearTimeout(timer);
+  current = id;
+  location.hash = id;
+  let job;
+  try {
+    job = await call(`/jobs/${id}`);
+  } catch (problem) {
+    if (problem.code) { show("job", false); show("result", false); return complain(problem); }
+    timer = setTimeout(() => watch(id), 3000); // the service is away; it may come back
+    return complain({ detail: "The service does not answer.", advice: "Trying again." });
+  }
+  if (current !== id) return;
+  complain(job.error);
+  const label = job.state === "running" && job.stage ? job.stage : job.state;
+  progress(job.cancel_requested ? "stopping" : label, job.fraction, job.time_left, job.message);
+  show("cancel", Boolean(job.links.cancel) && !job.cancel_requested);
+  show("delete", !job.links.cancel);
+  show("result", Boolean(job.links.render));
+  if (job.links.cancel) timer = setTimeout(() => watch(id), 1000);
+  else list();
+  if (job.links.render) {
+    picture();
+    const { assets } = await call(job.links.assets);
+    $("assets").replaceChildren(...assets.map((a) => row(a.name, a.href, `${(a.bytes / 1e6).toFixed(2)} MB`)));
+  }
+}
+
+function picture() {
+  const camera = `orbit:${$("yaw").value},0`;
+  const query = new URLSearchParams({ pose, camera, width: 512, height: 512, format: "webp" });
+  $("picture").classList.add("busy");
+  $("picture").src = `/jobs/${current}/render?${query}`;
+  for (const button of $("poses").children) button.setAttribute("aria-pressed", button.textContent === pose);
+}
+
+async function list() {
+  const { jobs } = await call("/jobs?limit=10");
+  $("jobs").replaceChildren(...jobs.map((job) => row(new Date(job.created_at).toLocaleString(), `#${job.id}`, job.state)));
+}
+
+$("poses").append(...POSES.map((name) => {
+  const button = Object.assign(document.createElement("button"), { textContent: name });
+  button.onclick = () => { pose = name; picture(); };
+  return button;
+}));
+$("picture").onload = $("picture").onerror = () => $("picture").classList.remove("busy");
+$("yaw").onchange = picture;
+$("file").onchange = (event) => event.target.files[0] && send(event.target.files[0]);
+$("cancel").onclick = () => call(`/jobs/${current}/cancel`, { method: "POST" }).catch(complain);
+$("delete").onclick = async () => {
+  await call(`/jobs/${current}`, { method: "DELETE" }).catch(complain);
+  current = null;
+  history.replaceState(null, "", "/");
+  show("job", false);
+  show("result", false);
+  list();
+};
+for (const [name, on] of [["dragover", true], ["dragleave", false], ["drop", false]]) {
+  $("drop").addEventListener(name, (event) => {
+    event.preventDefault();
+    $("drop").classList.toggle("over", on);
+    if (name === "drop" && event.dataTransfer.files[0]) send(event.dataTransfer.files[0]);
+  });
+}
+window.onhashchange = () => { const id = location.hash.slice(1); if (id && id !== current) watch(id); };
+list();
+if (location.hash) watch(location.hash.slice(1));

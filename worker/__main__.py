@@ -1,0 +1,28 @@
+"""``python -m worker``: take jobs until told to stop. Configured by MASS_* (service/settings.py)."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import warnings
+
+from celery.platforms import SecurityWarning
+
+from service.settings import Settings
+from worker.app import run_worker
+
+
+def main() -> int:
+    """Run one worker; returns the exit code."""
+    logging.basicConfig(
+        level=logging.INFO,
+        format="%(asctime)s worker[%(process)d] %(levelname)s %(message)s",
+        stream=sys.stderr,
+    )
+    # The warning is about messages that carry code, which root must not run; only JSON is accepted here.
+    warnings.simplefilter("ignore", SecurityWarning)
+    return run_worker(Settings())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""The worker process: Celery around the supervisor, the reconciler beside it.
+
+The pool is one thread. The task only watches a child process, so it needs no process of its own; the main
+thread stays in the event loop and keeps answering the broker during a job of an hour; and a signal to this
+process reaches the supervisor as an event, which ends the engine and gives the job back at once. (A solo pool
+would block the loop; a prefork pool adds a process that can be lost without the engine noticing.)
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+from typing import Any
+
+from celery import Celery, bootsteps, signals
+
+from service.jobs.store import create_store
+from service.pulse import PULSE_SECONDS, pulse_path
+from service.queue import create_celery, create_queue
+from service.settings import Settings
+from service.storage import create_storage
+from worker.reconciler import Reconciler
+from worker.supervisor import Supervisor
+from worker.tasks import register
+
+log = logging.getLogger(__name__)
+
+#: How long the reconciler may take to finish its round at the end.
+_RECONCILER_GRACE = 10.0
+
+
+def create_app(settings: Settings, supervisor: Supervisor) -> Celery:
+    """The consuming end of the queue, with the task and the sign of life."""
+    app = create_celery(settings)
+    app.conf.update(
+        worker_pool="threads",
+        worker_max_tasks_per_child=None,
+        worker_enable_remote_control=False,  # jobs are cancelled through their row
+        worker_hijack_root_logger=False,
+        worker_redirect_stdouts=False,
+    )
+    register(app, supervisor)
+    app.steps["worker"].add(_pulse_step(pulse_path(settings.data_dir)))
+    return app
+
+
+def run_worker(settings: Settings) -> int:
+    """Work until SIGTERM or SIGINT; returns the exit code. Must be called from the main thread."""
+    stopping = threading.Event()
+    store, storage, queue = create_store(settings), create_storage(settings), create_queue(settings)
+    supervisor = Supervisor(settings, store, storage, queue, stopping)
+    reconciler = Reconciler(settings, store, storage, queue)
+    app = create_app(settings, supervisor)
+
+    def stop(**_: Any) -> None:
+        stopping.set()
+
+    signals.worker_shutting_down.connect(stop, weak=False)
+    thread = threading.Thread(target=reconciler.run, args=(stopping,), name="reconciler", daemon=True)
+    thread.start()
+    worker = app.Worker(
+        concurrency=1,
+        pool="threads",
+        queues=[settings.queue_name],
+        without_mingle=True,
+        without_gossip=True,
+        without_heartbeat=True,
+        loglevel="INFO",
+        quiet=True,
+    )
+    try:
+        worker.start()
+    finally:
+        signals.worker_shutting_down.disconnect(stop)
+        stopping.set()
+        thread.join(_RECONCILER_GRACE)
+        queue.close()
+        store.close()
+    return int(worker.exitcode or 0)
+
+
+def _pulse_step(path: Path) -> type[Any]:
+    """A part of the worker that touches ``path`` from the event loop, so only while that loop turns."""
+
+    class Pulse(bootsteps.StartStopStep):  # type: ignore[misc]
+        requires = ("celery.worker.components:Timer",)
+
+        def start(self, worker: Any) -> None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            worker.timer.call_after(0.0, path.touch)
+            self._timer = worker.timer.call_repeatedly(PULSE_SECONDS, path.touch)
+
+        def stop(self, _worker: Any) -> None:
+            self._timer.cancel()
+            path.unlink(missing_ok=True)
+
+    return Pulse

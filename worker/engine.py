@@ -1,0 +1,192 @@
+"""The engine as a child process: its command line, its environment, its events, its end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import math
+import os
+import signal
+import subprocess
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from service.processes import launch, stop_group
+
+log = logging.getLogger(__name__)
+
+#: The options of a job and the engine's flags for them.
+FLAGS: dict[str, str] = {
+    "preset": "--preset",
+    "side": "--side",
+    "seed": "--seed",
+    "fov": "--fov",
+    "max_frames": "--max-frames",
+    "holdout": "--holdout",
+}
+
+#: All that the engine sees of our environment; passwords and URLs of the service are not in it.
+_ENVIRONMENT = frozenset(
+    {
+        *("PATH", "HOME", "LANG", "LC_ALL", "LC_CTYPE", "TZ", "TMPDIR", "XDG_CACHE_HOME", "MASS_MODEL_DIR"),
+        *("OMP_NUM_THREADS", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "SYSTEMROOT"),
+        *("CUDA_VISIBLE_DEVICES", "NVIDIA_VISIBLE_DEVICES", "NVIDIA_DRIVER_CAPABILITIES"),
+    }
+)
+
+_LIMITS = {"core": 0, "nofile": 4096, "fsize": 16 * 1024**3}
+_MAX_LINE = 64 * 1024
+_TAIL_LINES = 40
+
+
+@dataclass(frozen=True)
+class EngineProgress:
+    """One progress event; ``fraction`` is between 0 and 1, ``time_left`` in seconds or unknown."""
+
+    stage: str
+    fraction: float
+    time_left: float | None
+    message: str
+
+
+@dataclass(frozen=True)
+class EngineFailure:
+    """What the engine said was wrong: a stable code, a sentence, and what to do about it."""
+
+    code: str
+    message: str
+    advice: str
+
+
+class UnknownOptionError(ValueError):
+    """A job carries an option the engine has no flag for."""
+
+
+def fit_command(
+    engine: Sequence[str], video: Path, run: Path, options: Mapping[str, str | int | float | None]
+) -> list[str]:
+    """The command that fits ``video`` into the directory ``run``. Raises UnknownOptionError."""
+    unknown = sorted(set(options) - set(FLAGS))
+    if unknown:
+        raise UnknownOptionError(f"unknown option {unknown[0]!r}")
+    # One word per option, so that no value can be taken for a flag.
+    flags = [f"{FLAGS[name]}={value}" for name, value in options.items() if value is not None]
+    return [*engine, "fit", str(video), "--out", str(run), "--json", *flags]
+
+
+def engine_environment(source: Mapping[str, str] | None = None) -> dict[str, str]:
+    """The environment of the engine: the harmless part of ours, and what makes its output prompt."""
+    ours = os.environ if source is None else source
+    kept = {name: value for name, value in ours.items() if name in _ENVIRONMENT}
+    return {**kept, "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
+
+
+class EngineProcess:
+    """One run. Start it from the thread that stays until it ends; always call :meth:`stop` at the end."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self.progress: EngineProgress | None = None
+        self.failure: EngineFailure | None = None
+        self._tail: deque[str] = deque(maxlen=_TAIL_LINES)
+        self._closed = threading.Event()
+        self._process = launch(
+            command,
+            env=engine_environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            death_signal=signal.SIGKILL,
+            limits=_LIMITS,
+        )
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        self._readers = [
+            threading.Thread(target=self._read_events, args=(self._process.stdout,), daemon=True),
+            threading.Thread(target=self._read_tail, args=(self._process.stderr,), daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    @property
+    def pid(self) -> int:
+        """The process id, which is also the id of its group and session."""
+        return self._process.pid
+
+    @property
+    def tail(self) -> str:
+        """The last lines it wrote that were no events."""
+        return "\n".join(self._tail)
+
+    def wait(self, seconds: float) -> int | None:
+        """The exit code, negative for a signal, or None while it runs; returns early when it ends."""
+        if self._closed.wait(seconds):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(seconds)
+        return self._process.poll()
+
+    def stop(self, grace: float) -> int:
+        """End the whole process group: ask, wait ``grace`` seconds, kill. Also reaps one that has ended."""
+        code = stop_group(self._process, grace)
+        for reader in self._readers:
+            reader.join(5.0)
+        return code
+
+    def _read_events(self, stream: IO[bytes]) -> None:
+        with stream:
+            while line := stream.readline(_MAX_LINE):
+                self._take(line)
+        self._closed.set()
+
+    def _read_tail(self, stream: IO[bytes]) -> None:
+        with stream:
+            while line := stream.readline(_MAX_LINE):
+                self._tail.append(line.decode(errors="replace").rstrip()[:500])
+
+    def _take(self, line: bytes) -> None:
+        event = _parse(line)
+        kind = event.get("type")
+        if kind == "progress":
+            self.progress = _progress(event)
+        elif kind == "error":
+            self.failure = EngineFailure(
+                _text(event, "code", 80), _text(event, "message", 1000), _text(event, "advice", 1000)
+            )
+        elif kind == "warning":
+            log.info("engine %d warns: %s %s", self.pid, event.get("code"), event.get("message"))
+        elif kind != "done":
+            self._tail.append(line.decode(errors="replace").rstrip()[:500])
+
+
+def _parse(line: bytes) -> dict[str, Any]:
+    try:
+        event = json.loads(line)
+    except ValueError:  # a library that prints; bad UTF-8 is a ValueError as well
+        return {}
+    return event if isinstance(event, dict) else {}
+
+
+def _progress(event: Mapping[str, Any]) -> EngineProgress:
+    fraction = _number(event.get("fraction"))
+    time_left = _number(event.get("time_left"))
+    return EngineProgress(
+        stage=_text(event, "stage", 40),
+        fraction=min(max(fraction or 0.0, 0.0), 1.0),
+        time_left=None if time_left is None else max(time_left, 0.0),
+        message=_text(event, "message", 500),
+    )
+
+
+def _number(value: object) -> float | None:
+    """A finite number, else None."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def _text(event: Mapping[str, Any], key: str, longest: int) -> str:
+    value = event.get(key)
+    return value[:longest] if isinstance(value, str) else ""

@@ -1,0 +1,262 @@
+"""One job from claim to end: start the engine, keep the lease, pass on progress, obey, and write the result.
+
+Every write carries the fencing token of the claim. When the lease is lost, whoever has it now decides what
+the job becomes: this worker stops its engine, removes its own output and writes nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.jobs.housekeeping import purge_deleted
+from service.jobs.store import Claim, Heartbeat, JobStore
+from service.queue import JobQueue
+from service.settings import Settings
+from service.storage import Storage
+from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, fit_command
+
+log = logging.getLogger(__name__)
+
+#: How often the supervisor looks up from waiting, and how often it asks whether the job was cancelled.
+_TICK_SECONDS = 0.25
+_CANCEL_SECONDS = 1.0
+#: How long a cancelled engine, and one stopped by a shutdown, may take to end by itself.
+_CANCEL_GRACE = 2.0
+_SHUTDOWN_GRACE = 5.0
+
+#: Without these an exit code of 0 is not believed.
+OUTPUTS = ("avatar.safetensors", "report.json", "surfels.ply")
+
+_EXIT_BAD_ARGUMENTS = 2
+_EXIT_BAD_INPUT = 3
+
+
+class Outcome(StrEnum):
+    """How a worker's dealing with one message ended."""
+
+    REFUSED = "refused"  # the worker is stopping: the message is for another
+    SKIPPED = "skipped"  # nothing to do: somebody else has the job, or it is over
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+    RELEASED = "released"  # back in the queue
+    LOST = "lost"  # the lease went to somebody else
+
+
+class _Stop(StrEnum):
+    """Why the watch over a running engine ended."""
+
+    EXITED = "exited"
+    CANCEL = "cancel"
+    LOST = "lost"
+    SHUTDOWN = "shutdown"
+    TIMEOUT = "timeout"
+
+
+class Lease:
+    """Renews a claim in time and answers whether to go on. An unreachable database is waited for, until
+    the lease must have run out."""
+
+    def __init__(
+        self, store: JobStore, claim: Claim, settings: Settings, since: float, clock: Callable[[], float]
+    ) -> None:
+        """``since``: the clock just before the claim was made, so that we never think it lasts longer."""
+        self._store, self._claim, self._clock = store, claim, clock
+        self._seconds, self._every = settings.lease_seconds, settings.heartbeat_seconds
+        self._until = since + self._seconds
+        self._next_beat = since + self._every
+        self._next_look = since
+
+    def check(self) -> Heartbeat:
+        """Look for a cancellation every second and renew every ``heartbeat_seconds``."""
+        now = self._clock()
+        if now < min(self._next_look, self._next_beat):
+            return Heartbeat.OK
+        try:
+            if now < self._next_beat:
+                self._next_look = now + _CANCEL_SECONDS
+                job = self._store.get(self._claim.job_id)
+                if job is not None and not job.cancel_requested and job.token == self._claim.token:
+                    return Heartbeat.OK
+            return self.renew()
+        except SQLAlchemyError as error:
+            log.warning("job %s: database not reached (%s)", self._claim.job_id, type(error).__name__)
+            self._next_look = self._next_beat = self._clock() + _CANCEL_SECONDS
+            return Heartbeat.LOST if self._clock() >= self._until else Heartbeat.OK
+
+    def renew(self) -> Heartbeat:
+        """Renew now. Raises SQLAlchemyError when the database does not answer."""
+        now = self._clock()
+        answer = self._store.heartbeat(self._claim.job_id, self._claim.token, self._seconds)
+        self._until, self._next_beat = now + self._seconds, now + self._every
+        return answer
+
+
+class Supervisor:
+    """Deals with wake-up messages, one at a time per calling thread."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        store: JobStore,
+        storage: Storage,
+        queue: JobQueue,
+        stopping: threading.Event,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._settings, self._store, self._storage, self._queue = settings, store, storage, queue
+        self._stopping = stopping
+        self._clock = clock
+
+    def run(self, job_id: str) -> Outcome:
+        """Do the job if it can be claimed. Raises only when the database cannot be reached."""
+        if self._stopping.is_set():
+            return Outcome.REFUSED
+        since = self._clock()
+        claim = self._store.claim(job_id, lease_seconds=self._settings.lease_seconds)
+        if claim is None:
+            return Outcome.SKIPPED
+        log.info("job %s: attempt %d starts", job_id, claim.attempt)
+        lease = Lease(self._store, claim, self._settings, since, self._clock)
+        try:
+            outcome = self._work(claim, lease)
+        except SQLAlchemyError:
+            # Nothing more can be written; the lease runs out and the reconciler takes the job back.
+            log.exception("job %s: the database stopped answering", job_id)
+            outcome = Outcome.LOST
+        except Exception:
+            log.exception("job %s: the worker failed", job_id)
+            outcome = self._again(claim, "worker.failed", "The worker could not run the engine.")
+        log.info("job %s: attempt %d %s", job_id, claim.attempt, outcome)
+        if outcome is not Outcome.SUCCEEDED:
+            shutil.rmtree(self._storage.artifact_path(job_id, claim.artifact), ignore_errors=True)
+        if outcome is Outcome.CANCELLED:
+            purge_deleted(self._store, self._storage)  # DELETE of a running job ends as a cancellation
+        return outcome
+
+    def _work(self, claim: Claim, lease: Lease) -> Outcome:
+        # What earlier attempts left is of no use to this one, and nobody else may publish it any more.
+        self._storage.drop_attempts(claim.job_id)
+        run = self._storage.attempt_dir(claim.job_id, claim.artifact)
+        video = self._storage.source(claim.video)
+        try:
+            command = fit_command(self._settings.engine, video, run, claim.options)
+        except UnknownOptionError as error:
+            return self._fail(claim, "options.invalid", f"The job has an {error}.", "Submit it without.")
+        engine = EngineProcess(command)
+        grace = 0.0
+        try:
+            stop = self._watch(claim, lease, engine)
+            grace = {_Stop.CANCEL: _CANCEL_GRACE, _Stop.SHUTDOWN: _SHUTDOWN_GRACE}.get(stop, 0.0)
+        finally:
+            code = engine.stop(grace)
+        match stop:
+            case _Stop.LOST:
+                return Outcome.LOST
+            case _Stop.CANCEL:
+                return self._cancelled(claim)
+            case _Stop.SHUTDOWN:
+                return self._release(claim, refund=True)
+            case _Stop.TIMEOUT:
+                return self._fail(
+                    claim,
+                    "engine.timeout",
+                    f"The reconstruction did not finish within {self._settings.job_timeout:g} s.",
+                    "Submit a shorter clip, or a lower preset.",
+                )
+            case _Stop.EXITED:
+                return self._conclude(claim, lease, engine, code, run)
+
+    def _watch(self, claim: Claim, lease: Lease, engine: EngineProcess) -> _Stop:
+        deadline = self._clock() + self._settings.job_timeout
+        shown: EngineProgress | None = None
+        while engine.wait(_TICK_SECONDS) is None:
+            if self._stopping.is_set():
+                return _Stop.SHUTDOWN
+            if self._clock() > deadline:
+                return _Stop.TIMEOUT
+            answer = lease.check()
+            if answer is not Heartbeat.OK:
+                return _Stop.CANCEL if answer is Heartbeat.CANCEL else _Stop.LOST
+            if engine.progress is not shown:
+                shown = engine.progress
+                self._show(claim, engine.progress)
+        return _Stop.EXITED
+
+    def _show(self, claim: Claim, progress: EngineProgress | None) -> None:
+        if progress is None:
+            return
+        try:
+            self._store.report_progress(
+                claim.job_id,
+                claim.token,
+                progress.stage,
+                progress.fraction,
+                progress.time_left,
+                progress.message,
+            )
+        except SQLAlchemyError as error:
+            # Progress may be missed; the lease decides how long to go on without a database.
+            log.warning("job %s: progress not written (%s)", claim.job_id, type(error).__name__)
+
+    def _conclude(self, claim: Claim, lease: Lease, engine: EngineProcess, code: int, run: Path) -> Outcome:
+        said = engine.failure
+        if code == 0:
+            missing = [name for name in OUTPUTS if not (run / name).is_file()]
+            if not missing:
+                return self._succeed(claim, lease)
+            log.error("job %s: the engine left no %s", claim.job_id, ", ".join(missing))
+        elif code == _EXIT_BAD_ARGUMENTS:
+            log.error("job %s: the engine refused its arguments: %s", claim.job_id, engine.tail)
+            message = said.message if said else "The engine does not accept these options."
+            return self._fail(
+                claim, "options.invalid", message, (said and said.advice) or "Submit with other options."
+            )
+        elif code == _EXIT_BAD_INPUT and said is not None and said.code:
+            return self._fail(claim, said.code, said.message, said.advice)
+        else:
+            log.error("job %s: the engine ended with %d: %s", claim.job_id, code, engine.tail)
+        return self._again(claim, "engine.crashed", f"The engine stopped unexpectedly ({_describe(code)}).")
+
+    def _succeed(self, claim: Claim, lease: Lease) -> Outcome:
+        answer = lease.renew()  # making the files durable takes a while
+        if answer is Heartbeat.OK:
+            self._storage.publish(claim.job_id, claim.artifact)
+            if self._store.succeed(claim.job_id, claim.token, claim.artifact):
+                return Outcome.SUCCEEDED
+        return self._cancelled(claim)
+
+    def _cancelled(self, claim: Claim) -> Outcome:
+        ended = self._store.finish_cancel(claim.job_id, claim.token)
+        return Outcome.CANCELLED if ended else Outcome.LOST
+
+    def _fail(self, claim: Claim, code: str, message: str, advice: str) -> Outcome:
+        ended = self._store.fail(claim.job_id, claim.token, code, message, advice)
+        return Outcome.FAILED if ended else Outcome.LOST
+
+    def _again(self, claim: Claim, code: str, message: str) -> Outcome:
+        """Another attempt, or the end when this was the last one."""
+        if claim.attempt < self._settings.max_attempts:
+            return self._release(claim, refund=False)
+        advice = "Submit the video again; if it fails the same way, try a shorter or smaller clip."
+        return self._fail(claim, code, f"{message} It was tried {claim.attempt} times.", advice)
+
+    def _release(self, claim: Claim, *, refund: bool) -> Outcome:
+        if not self._store.release(claim.job_id, claim.token, refund=refund):
+            return Outcome.LOST
+        # The row is queued and due: should the broker be away, a reconciler sends the message.
+        if self._queue.publish(claim.job_id):
+            self._store.mark_published(claim.job_id)
+        return Outcome.RELEASED
+
+
+def _describe(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit code {code}"

@@ -30,7 +30,7 @@ from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose, Side
 from mass_engine.hand.poses import POSE_NAMES, parse_pose
 from mass_engine.raster import RasterOptions, RenderOutput
-from mass_engine.surfel.binding import MeshBinding
+from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
 from mass_engine.surfel.cloud import SurfelCloud
 from mass_engine.surfel.harmonics import rgb_to_sh0
 from mass_engine.viewpoint import parse_camera
@@ -82,15 +82,12 @@ class Avatar:
     def posed(self, pose: HandPose) -> PosedSurfels:
         """Kept surfels of a batch of poses [B]."""
         with torch.no_grad():
-            all_surfels = pose_surfels(self.shape, self.binding, pose)
-            return PosedSurfels(
-                all_surfels.means[:, self.kept],
-                all_surfels.scales[:, self.kept],
-                all_surfels.quats[:, self.kept],
-                all_surfels.normals[:, self.kept],
-                all_surfels.bone_rotations,
-                all_surfels.joints,
+            posed = pose_surfels(self.shape, self.binding, pose)
+            every = posed.attached
+            kept = AttachedSurfels(
+                every.means[:, self.kept], every.tangents[:, self.kept], every.normals[:, self.kept]
             )
+            return PosedSurfels(kept, posed.bone_rotations, posed.joints)
 
     def render_pose(
         self, pose: HandPose, camera: Camera, options: RasterOptions | None = None
@@ -171,14 +168,17 @@ class Avatar:
             self.appearance.sh[:, :0],
             self.appearance.light,
         )
-        colors = surfel_colors(plain, surfels, 0, self.binding.bones[self.kept], self.camera)
+        attached = surfels.row(0)
+        bones = self.binding.bones[self.kept]
+        colors = surfel_colors(plain, attached, surfels.bone_rotations[0], bones, self.camera)
+        scales, quats = attached.scales_quats()
         sh = rgb_to_sh0(colors).unsqueeze(1)
         if pose_spec.strip() == "rest":
             sh = torch.cat([sh, self.appearance.sh], 1)
         return SurfelCloud(
-            surfels.means[0],
-            surfels.scales[0],
-            surfels.quats[0],
+            attached.means,
+            scales,
+            quats,
             torch.sigmoid(self.appearance.opacity_logits),
             sh,
             self.binding.surfel_faces[self.kept],

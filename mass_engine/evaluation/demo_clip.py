@@ -55,7 +55,7 @@ def demo_frames(options: ClipOptions | None = None) -> Iterator[NDArray[np.uint8
     # Light from above and a little from the left; x right, y down, z away from the camera.
     light[0], light[1], light[2], light[3] = 0.82, -0.22, -0.20, -0.08
     look = Appearance(
-        _skin(rest.means[0], rest.normals[0], random),
+        _skin(rest.attached.means[0], rest.attached.normals[0], random),
         torch.full((binding.count,), 4.0),
         torch.zeros(binding.count, 0, 3),
         light,

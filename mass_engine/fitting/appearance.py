@@ -14,12 +14,12 @@ from mass_engine.fitting.subject import (
     Appearance,
     PosedSurfels,
     Shape,
+    draw,
     pose_surfels,
     render_row,
-    surfel_colors,
 )
 from mass_engine.fitting.views import Level, View
-from mass_engine.raster import RasterOptions, rasterize
+from mass_engine.raster import RasterOptions
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import irradiance_basis
 
@@ -95,20 +95,12 @@ class AppearanceFit:
         for done, row in enumerate(rows):
             level, surfels = self.views[row].level(side), self.surfels(row)
             colors = torch.zeros(size, 3, requires_grad=True)
-            out = rasterize(
-                surfels.means[0],
-                surfels.quats[0],
-                surfels.scales[0],
-                opacities,
-                colors,
-                level.camera,
-                options=self.raster,
-            )
+            out = draw(surfels.row(0), opacities, colors, level.camera, self.raster)
             cover = level.hand.unsqueeze(-1)
             (seen,) = torch.autograd.grad(out.rgb, colors, level.rgb * cover, retain_graph=True)
             kinds = torch.stack([level.hand, 1 - level.valid, (1 - level.hand) * level.valid], -1)
             (weights,) = torch.autograd.grad(out.rgb, colors, kinds)
-            shading = (irradiance_basis(surfels.normals[0]) @ light).clamp_min(0.05)
+            shading = (irradiance_basis(surfels.attached.normals[0]) @ light).clamp_min(0.05)
             hand, ignored, background = hand + weights[:, 0], ignored + weights[:, 1], background + weights[:, 2]
             numerator += shading * seen
             denominator += shading.square() * weights[:, :1]

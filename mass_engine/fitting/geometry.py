@@ -5,6 +5,7 @@ The same loop refines the poses of held-out frames: then everything shared is fr
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -16,7 +17,7 @@ from mass_engine.fitting import losses
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.subject import Appearance, Shape, mesh_edges, pose_surfels, render_row
 from mass_engine.fitting.views import View
-from mass_engine.hand.builtin import JOINT_LIMITS, joint_frames
+from mass_engine.hand.builtin import joint_frames, joint_limits
 from mass_engine.raster import RasterOptions
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.tracking.alignment import hand_size_pixels, limit_excess
@@ -72,7 +73,7 @@ class GeometryFit:
         self.rejected_steps = 0
         self._random = torch.Generator().manual_seed(seed)
         self._edges = mesh_edges(shape.model.faces)
-        self._limits, self._frames = JOINT_LIMITS(shape.model.side), joint_frames(shape.model.side)
+        self._limits, self._frames = joint_limits(), joint_frames(shape.model)
         self._points = torch.stack([torch.from_numpy(view.points) for view in views])
         self._sizes = hand_size_pixels(self._points)
         self._scores = torch.tensor([view.score for view in views])
@@ -181,17 +182,15 @@ class GeometryFit:
 
 def _neighbours(views: list[View], trained: list[int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """For every row: the training rows before and after, where between them it lies, and how near they are."""
-    before, after, mix, near = [], [], [], []
+    before, after = torch.arange(len(views)), torch.arange(len(views))
+    mix, near = torch.full((len(views),), 0.5), torch.zeros(len(views))
     for row, view in enumerate(views):
-        earlier = [other for other in trained if views[other].time < view.time]
-        later = [other for other in trained if views[other].time > view.time]
-        if not earlier or not later:
-            before.append(row), after.append(row), mix.append(0.5), near.append(0.0)
+        earlier, later = bisect_left(trained, row) - 1, bisect_right(trained, row)
+        if earlier < 0 or later >= len(trained):
             continue
-        low, high = views[earlier[-1]].time, views[later[0]].time
-        before.append(earlier[-1])
-        after.append(later[0])
-        mix.append((view.time - low) / (high - low))
+        before[row], after[row] = trained[earlier], trained[later]
+        low, high = views[trained[earlier]].time, views[trained[later]].time
+        mix[row] = (view.time - low) / (high - low)
         # Two frames apart at 30 a second is near; the pull falls with the square of the span.
-        near.append(min(1.0, ((high - low) * 15) ** -2))
-    return torch.tensor(before), torch.tensor(after), torch.tensor(mix), torch.tensor(near)
+        near[row] = min(1.0, ((high - low) * 15) ** -2)
+    return before, after, mix, near

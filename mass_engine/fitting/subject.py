@@ -11,7 +11,7 @@ from mass_engine.camera import Camera
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
 from mass_engine.raster import RasterOptions, RenderOutput, rasterize
-from mass_engine.surfel.binding import MeshBinding
+from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
 from mass_engine.surfel.harmonics import evaluate_sh_rest
 from mass_engine.surfel.shading import shade
 
@@ -65,44 +65,40 @@ class Appearance:
 
 @dataclass
 class PosedSurfels:
-    """Surfels of a batch of poses: ``means`` [B,N,3], ``scales`` [B,N,2], ``quats`` [B,N,4], ``normals``
-    [B,N,3], ``bone_rotations`` [B,16,3,3] and ``joints`` [B,21,3]."""
+    """Surfels of a batch of poses (means [B,N,3], tangents [B,N,2,3], normals [B,N,3]), with
+    ``bone_rotations`` [B,16,3,3] and ``joints`` [B,21,3]."""
 
-    means: Tensor
-    scales: Tensor
-    quats: Tensor
-    normals: Tensor
+    attached: AttachedSurfels
     bone_rotations: Tensor
     joints: Tensor
 
-
-def quat_normal(quats: Tensor) -> Tensor:
-    """The third axis of the rotations ``quats`` [...,4] (wxyz, unit) -> [...,3]."""
-    w, x, y, z = quats.unbind(-1)
-    return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
+    def row(self, row: int) -> AttachedSurfels:
+        """The surfels of one pose of the batch."""
+        a = self.attached
+        return AttachedSurfels(a.means[row], a.tangents[row], a.normals[row])
 
 
 def pose_surfels(shape: Shape, binding: MeshBinding, pose: HandPose) -> PosedSurfels:
     """Pose the hand and register a surfel in every small triangle; ``pose`` is batched [B]."""
     posed = shape.model.posed(pose, shape.offsets())
-    means, scales, quats = binding.surfels(posed.vertices)
-    return PosedSurfels(
-        means, scales, quats, quat_normal(quats), posed.bone_transforms[..., :3, :3], posed.joints
-    )
+    return PosedSurfels(binding.surfels(posed.vertices), posed.bone_transforms[..., :3, :3], posed.joints)
 
 
 def surfel_colors(
-    appearance: Appearance, surfels: PosedSurfels, row: int, bones: Tensor, camera: Camera
+    appearance: Appearance, surfels: AttachedSurfels, bone_rotations: Tensor, bones: Tensor, camera: Camera
 ) -> Tensor:
-    """Colours [N,3] of the ``row``-th pose seen by ``camera``; ``bones`` [N] is each surfel's bone."""
-    colors = shade(appearance.albedo, appearance.light, surfels.normals[row])
+    """Colours [N,3] of the surfels of one pose seen by ``camera``.
+
+    ``bone_rotations`` [16,3,3] are the pose's, ``bones`` [N] says which one each surfel follows.
+    """
+    colors = shade(appearance.albedo, appearance.light, surfels.normals)
     if appearance.sh.shape[1] == 0:
         return colors
     rotation = camera.world_to_camera[:3, :3]
     center = -rotation.T @ camera.world_to_camera[:3, 3]
-    directions = torch.nn.functional.normalize(surfels.means[row].detach() - center, dim=-1)
+    directions = torch.nn.functional.normalize(surfels.means.detach() - center, dim=-1)
     # Into the rest frame of the bone: what the skin does with light turns with the skin.
-    turned = torch.einsum("nji,nj->ni", surfels.bone_rotations[row][bones].detach(), directions)
+    turned = (directions.unsqueeze(-2) @ bone_rotations.detach()[bones]).squeeze(-2)
     return (colors + evaluate_sh_rest(appearance.sh, turned)).clamp_min(0.0)
 
 
@@ -115,14 +111,28 @@ def render_row(
     options: RasterOptions,
     background: Tensor | None = None,
 ) -> RenderOutput:
-    """Rasterise the ``row``-th pose."""
-    return rasterize(
-        surfels.means[row],
-        surfels.quats[row],
-        surfels.scales[row],
+    """Rasterise one pose of the batch."""
+    attached = surfels.row(row)
+    return draw(
+        attached,
         torch.sigmoid(appearance.opacity_logits),
-        surfel_colors(appearance, surfels, row, bones, camera),
+        surfel_colors(appearance, attached, surfels.bone_rotations[row], bones, camera),
         camera,
-        background=background,
-        options=options,
+        options,
+        background,
+    )
+
+
+def draw(
+    surfels: AttachedSurfels,
+    opacities: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    options: RasterOptions,
+    background: Tensor | None = None,
+) -> RenderOutput:
+    """Rasterise surfels [N] with ``opacities`` [N] and ``colors`` [N,3]."""
+    scales, quats = surfels.scales_quats()
+    return rasterize(
+        surfels.means, quats, scales, opacities, colors, camera, background=background, options=options
     )

@@ -34,7 +34,8 @@ class HandPose:
 
     ``betas`` [...,10]; ``global_orient`` [...,3] and ``hand_pose`` [...,45] axis-angle in radians
     (absolute: zero is the flat rest hand); ``transl`` [...,3] in metres. A left hand is described in
-    the left model's own frame: the right hand's pose mirrored has y and z of every axis-angle negated.
+    the left model's own frame: the right hand mirrored in x (as in MANO), so y and z of every axis-angle
+    change sign.
     """
 
     betas: Tensor

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from mass_engine.camera import Camera
-from mass_engine.hand.builtin import JOINT_LIMITS, joint_frames
+from mass_engine.hand.builtin import joint_frames, joint_limits
 from mass_engine.hand.model import HandModel, axis_angle_to_matrix
 from mass_engine.hand.pose import JOINT_PARENTS, TIP_PARENTS, HandPose
 from mass_engine.tracking.landmarks import HandLandmarks
@@ -121,7 +121,7 @@ def align_landmarks(
     begin = start if start is not None else initial_pose(model, landmarks, camera)
     parents, children = (torch.tensor(column) for column in zip(*BONES, strict=True))
     seen_direction = torch.nn.functional.normalize(world[:, children] - world[:, parents], dim=-1)
-    limits, frames = JOINT_LIMITS(model.side), joint_frames(model.side)
+    limits, frames = joint_limits(), joint_frames(model)
     smooth_weight = _acceleration_weights(times)
 
     free_betas = torch.zeros(10) if betas is None else betas.clone()

@@ -49,10 +49,15 @@ def pixels_per_mm(points: NDArray[np.floating]) -> float:
 
 @dataclass(frozen=True)
 class CapsuleHand:
-    """The rough hand in an image window: ``distance`` [h,w] mm to its outline (negative inside) and
-    ``forearm`` [h,w] bool, the corridor beyond the wrist; ``scale`` pixels per mm in the window."""
+    """The rough hand in an image window of [h,w] pixels, at ``scale`` pixels per mm.
+
+    ``distance`` mm to its outline, negative inside; ``along`` mm from the wrist down the forearm (negative
+    towards the fingers) and ``across`` mm from the forearm's axis; ``forearm`` bool, the corridor beyond the wrist.
+    """
 
     distance: NDArray[np.float32]
+    along: NDArray[np.float32]
+    across: NDArray[np.float32]
     forearm: NDArray[np.bool_]
     scale: float
 
@@ -71,7 +76,9 @@ def draw(points: NDArray[np.floating], scale: float, height: int, width: int) ->
     outside = cv2.distanceTransform(255 - canvas, cv2.DIST_L2, 3)
     inside = cv2.distanceTransform(canvas, cv2.DIST_L2, 3)
     distance = np.asarray((outside - inside) / scale, np.float32)
-    return CapsuleHand(distance, _forearm(points, scale, height, width) & (distance > 2.0), scale)
+    along, across = _forearm_axes(points, scale, height, width)
+    forearm = (along > 5.0) & (across < 42.0 + 0.35 * along) & (distance > 2.0)
+    return CapsuleHand(distance, along, across, forearm, scale)
 
 
 def _capsule(
@@ -98,12 +105,14 @@ def _capsule(
     cv2.fillConvexPoly(canvas, np.round(corners * (1 << _SUB)).astype(np.int32), 255, cv2.LINE_8, _SUB)
 
 
-def _forearm(points: NDArray[np.floating], scale: float, height: int, width: int) -> NDArray[np.bool_]:
-    """Beyond the wrist, within a widening corridor of a forearm's width."""
+def _forearm_axes(
+    points: NDArray[np.floating], scale: float, height: int, width: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """``along`` and ``across`` of :class:`CapsuleHand`."""
     wrist = points[0].astype(np.float64)
     axis = wrist - points[[1, 4, 10, 7]].mean(0)
-    axis /= max(float(np.hypot(*axis)), 1e-6)
-    y, x = np.mgrid[0:height, 0:width] + 0.5
-    along = ((x - wrist[0]) * axis[0] + (y - wrist[1]) * axis[1]) / scale
-    across = np.abs((x - wrist[0]) * axis[1] - (y - wrist[1]) * axis[0]) / scale
-    return np.asarray((along > 5.0) & (across < 42.0 + 0.35 * along))
+    axis /= max(float(np.hypot(*axis)), 1e-6) * scale
+    x = (np.arange(width) + 0.5 - wrist[0])[None]
+    y = (np.arange(height) + 0.5 - wrist[1])[:, None]
+    along = (x * axis[0] + y * axis[1]).astype(np.float32)
+    return along, np.abs(x * axis[1] - y * axis[0]).astype(np.float32)

@@ -59,7 +59,11 @@ def anchors() -> NDArray[np.float32]:
 
 
 def decode(
-    raw: NDArray[np.float32], logits: NDArray[np.float32], centres: NDArray[np.float32], side: int, floor: float
+    raw: NDArray[np.float32],
+    logits: NDArray[np.float32],
+    centres: NDArray[np.float32],
+    side: int,
+    floor: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Network outputs ``raw`` [A,18] and ``logits`` [A,1] -> scores [n] and points [n,9,2] above ``floor``.
 

@@ -19,6 +19,11 @@ BACKGROUND, IGNORE, HAND = 0, 128, 255
 
 _WORK = 256  # longest side of the window in which masks are computed, pixels
 _EXPAND = 1.5  # window over the landmarks' bounding box
+_ROUNDS = 3
+_COLOR_LIMIT = 4.0  # largest log ratio a colour may give
+_UNSEEN = 3e-6  # density floor: a colour never seen says nothing
+_BARE_ARM = 0.5  # forearm colours this much like the hand's are skin, not a sleeve
+_CUFF = -50.0  # how far (mm, measured from the wrist) a sleeve may reach over the hand
 
 
 @dataclass(frozen=True)
@@ -84,48 +89,78 @@ def _window(rgb: NDArray[np.uint8], landmarks: HandLandmarks) -> _Window:
     return _Window(box, small, _bins(small), capsules.draw(points, scale, size[1], size[0]))
 
 
+@dataclass(frozen=True)
+class ColorModel:
+    """Log-likelihood ratios per colour bin: hand over background, and sleeve over hand."""
+
+    hand: NDArray[np.float32]
+    sleeve: NDArray[np.float32]
+
+
 class HandSegmenter:
     """Labels the pixels around one hand. Made by :meth:`train` from frames of the same clip."""
 
-    def __init__(self, log_ratio: NDArray[np.float32]) -> None:
-        self._log_ratio = log_ratio
+    def __init__(self, colors: ColorModel) -> None:
+        self._colors = colors
 
     @staticmethod
     def train(samples: Sequence[tuple[NDArray[np.uint8], HandLandmarks]]) -> HandSegmenter:
-        """Learn hand and background colours from (upright frame, landmarks) pairs; 10 to 30 spread ones do.
+        """Learn hand, sleeve and background colours from (upright frame, landmarks) pairs; 10 to 30 spread ones do.
 
-        Two rounds: colours under the rough hand first, then colours weighted by the first model's belief.
+        Colours under the rough hand come first, then colours weighted by the previous model's belief.
         """
         windows = [_window(rgb, landmarks) for rgb, landmarks in samples]
-        ratio = np.zeros(int(np.prod(_BINS)), np.float32)
-        for round_ in range(3):
-            hand, other = (np.zeros(ratio.size, np.float64) for _ in range(2))
+        colors: ColorModel | None = None
+        for _ in range(_ROUNDS):
+            hand, other, sleeve = (np.zeros(int(np.prod(_BINS)), np.float64) for _ in range(3))
             for window in windows:
-                free = ~window.hand.forearm
-                d, bins = window.hand.distance[free], window.bins[free]
-                if round_ == 0:
-                    belief = np.where(d < -2.0, 1.0, 0.0)
-                    known = (d < -2.0) | (d > 8.0)
-                    belief, bins = belief[known], bins[known]
+                rough, bins = window.hand, window.bins
+                arm = (
+                    (rough.along > 12.0)
+                    & (rough.along < 70.0)
+                    & (rough.across < 22.0)
+                    & (rough.distance > 2.0)
+                )
+                sleeve += np.bincount(bins[arm], minlength=sleeve.size)
+                if colors is None:
+                    belief = np.where(rough.distance < -2.0, 1.0, 0.0)
+                    use = (belief > 0) & (rough.along < _CUFF) | (rough.distance > 8.0) & ~rough.forearm
                 else:
-                    belief = 1 / (1 + np.exp(-(ratio[bins] + _prior(d))))
-                hand += np.bincount(bins, belief, ratio.size)
-                other += np.bincount(bins, 1 - belief, ratio.size)
-            ratio = _log_ratio(hand, other)
-        return HandSegmenter(ratio)
+                    belief = 1 / (1 + np.exp(-(colors.hand[bins] + _prior(rough.distance))))
+                    use = ~rough.forearm & ~_sleeved(colors, window)
+                hand += np.bincount(bins[use], belief[use], hand.size)
+                other += np.bincount(bins[use], 1 - belief[use], hand.size)
+            colors = ColorModel(_log_ratio(hand, other), _sleeve_ratio(sleeve, hand))
+        assert colors is not None
+        return HandSegmenter(colors)
 
     def __call__(self, rgb: NDArray[np.uint8], landmarks: HandLandmarks) -> HandMask:
         """Label the window around ``landmarks`` in the upright frame ``rgb`` uint8 [H,W,3]."""
         window = _window(rgb, landmarks)
-        belief = self._log_ratio[window.bins] + _prior(window.hand.distance)
+        belief = self._colors.hand[window.bins] + _prior(window.hand.distance)
         belief = cv2.GaussianBlur(belief, (0, 0), 1.0)
-        mask = _connected(_cut(window, belief), window.hand)
+        sleeve = _sleeved(self._colors, window)
+        ignore = window.hand.forearm | sleeve
+        mask = _connected(_cut(window, belief, ignore) & ~sleeve, window.hand)
         _, _, w, h = window.box
         soft = cv2.resize(mask.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
-        arm = cv2.resize(window.hand.forearm.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
+        arm = cv2.resize(ignore.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
         labels = np.where(soft > 0.5, HAND, BACKGROUND).astype(np.uint8)
-        labels[arm > 0] = IGNORE
+        labels[(arm > 0) & (soft <= 0.5)] = IGNORE
         return HandMask(window.box, labels)
+
+
+def _sleeved(colors: ColorModel, window: _Window) -> NDArray[np.bool_]:
+    """Pixels of a sleeve that reaches over the wrist: its colour, near the wrist, joined to the forearm."""
+    rough = window.hand
+    near = (rough.along > _CUFF) & (rough.across < 45.0 + 0.35 * np.maximum(rough.along, 0))
+    score = cv2.GaussianBlur(colors.sleeve[window.bins], (0, 0), 1.0)
+    alike = (near & (score > 0.5)).astype(np.uint8)
+    alike = cv2.morphologyEx(alike, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    count, pieces = cv2.connectedComponents(alike, connectivity=4)
+    reaches = np.bincount(pieces[rough.along > 0], minlength=count) > 0
+    reaches[0] = False
+    return np.asarray(reaches[pieces])
 
 
 def _prior(distance: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -133,17 +168,24 @@ def _prior(distance: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.clip(-0.35 * (distance - 1.0), -6.0, 3.5), np.float32)
 
 
-def _log_ratio(hand: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float32]:
+def _sleeve_ratio(sleeve: NDArray[np.float64], hand: NDArray[np.float64]) -> NDArray[np.float32]:
+    """As :func:`_log_ratio`, sleeve over hand; never in favour of a sleeve where the forearm is bare."""
+    alike = float(np.sqrt(_density(sleeve) * _density(hand)).sum())  # Bhattacharyya coefficient
+    ratio = _log_ratio(sleeve, hand)
+    return ratio if alike < _BARE_ARM else np.full_like(ratio, -_COLOR_LIMIT)
+
+
+def _log_ratio(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float32]:
     """Smoothed log-likelihood ratio per colour bin, limited so that no colour alone decides."""
-    densities = []
-    for counts in (hand, other):
-        cube = counts.reshape(_BINS)
-        for axis in range(3):
-            cube = _blur_axis(cube, axis)
-        densities.append(cube.ravel() / max(float(cube.sum()), 1e-9))
-    floor = 3e-6  # a colour never seen says nothing
-    ratio = np.log((densities[0] + floor) / (densities[1] + floor))
-    return np.asarray(np.clip(ratio, -4.0, 4.0), np.float32)
+    ratio = np.log((_density(one) + _UNSEEN) / (_density(other) + _UNSEEN))
+    return np.asarray(np.clip(ratio, -_COLOR_LIMIT, _COLOR_LIMIT), np.float32)
+
+
+def _density(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+    cube = counts.reshape(_BINS)
+    for axis in range(3):
+        cube = _blur_axis(cube, axis)
+    return cube.ravel() / max(float(cube.sum()), 1e-9)
 
 
 def _blur_axis(cube: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
@@ -153,13 +195,13 @@ def _blur_axis(cube: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
     return np.moveaxis(blurred.reshape(moved.shape), 0, axis)
 
 
-def _cut(window: _Window, belief: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _cut(window: _Window, belief: NDArray[np.float32], ignore: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """One GrabCut pass from ``belief`` (log-odds); the belief itself where a cut is not possible."""
     distance = window.hand.distance
     mask = np.where(belief > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     mask[(distance < -3.0) & (belief > 1.0)] = cv2.GC_FGD
     mask[(distance > 18.0) | (belief < -7.0)] = cv2.GC_BGD
-    mask[window.hand.forearm] = cv2.GC_BGD
+    mask[ignore] = cv2.GC_BGD
     hand = int(np.count_nonzero((mask == cv2.GC_FGD) | (mask == cv2.GC_PR_FGD)))
     if min(hand, mask.size - hand) < 50:
         return np.asarray(belief > 0)

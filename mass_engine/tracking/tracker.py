@@ -18,12 +18,13 @@ from mass_engine.tracking.region import Region
 class TrackerOptions:
     """Thresholds on the networks' scores, and how much is searched.
 
-    ``keep`` presence to go on following a hand; ``accept`` presence to begin; ``palm_floor`` lowest palm
+    ``keep`` presence to go on following a hand; ``doubt`` presence below which its reading is not used to look again; ``accept`` presence to begin; ``palm_floor`` lowest palm
     score worth a look; ``max_hands`` followed at once; ``look_every`` frames between looks for a further
     hand; ``recrop`` region change above which a frame is read a second time.
     """
 
     keep: float = 0.5
+    doubt: float = 0.25
     accept: float = 0.8
     palm_floor: float = 0.05
     max_hands: int = 2
@@ -56,12 +57,13 @@ class HandTracker:
         """Hands in one upright frame ``rgb`` uint8 [H,W,3], in the order they were first seen.
 
         With ``update=False`` the frame is read from the present state and leaves it as it was, so what is
-        found in any other frame does not depend on this one.
+        found in any other frame does not depend on this one; a hand first seen here has ``track`` -1.
         """
         state, hands = self._step(rgb, index)
         if update:
             self._state = state
-        return hands
+            return hands
+        return [replace(h, track=-1) if h.track >= self._state.next_track else h for h in hands]
 
     def _step(self, rgb: NDArray[np.uint8], index: int) -> tuple[_State, list[HandLandmarks]]:
         options, old = self._options, self._state
@@ -91,14 +93,28 @@ class HandTracker:
         return state, [_landmarks(index, track, reading) for track, reading in found]
 
     def _follow(self, rgb: NDArray[np.uint8], region: Region) -> Reading | None:
-        """The hand that was in ``region`` a frame ago; read twice when it moved much."""
+        """The hand that was in ``region`` a frame ago; read twice when it moved much.
+
+        A hand that is followed is often read well while its presence is low (a fist from behind, a sleeve in
+        front). Before it is given up, slightly changed regions are tried: if one is convincing, it is there.
+        """
+        options = self._options
         reading = self._read(rgb, region)
-        if reading.score < self._options.keep / 2:
-            return None
         moved = region_of(reading.points)
-        if region.difference(moved) > self._options.recrop:
+        if region.difference(moved) > options.recrop and reading.score >= options.doubt:
             reading = self._read(rgb, moved)
-        return reading if reading.score >= self._options.keep and _is_plausible(reading, rgb) else None
+        if not _is_plausible(reading, rgb):
+            return None
+        if reading.score >= options.keep:
+            return reading
+        others = [self._read(rgb, other) for other in _variants(region)]
+        best = max(others, key=lambda other: other.score)
+        if best.score < options.keep:
+            return None
+        # Far from the steady reading, the variant saw something else; trust it only when it is sure.
+        if not _is_double(best, [reading]):
+            return best if best.score >= options.accept and _is_plausible(best, rgb) else None
+        return reading
 
     def _search(
         self, rgb: NDArray[np.uint8], known: Sequence[Reading], lost: Sequence[Region], thorough: bool
@@ -160,6 +176,13 @@ def _direct_regions(height: int, width: int) -> list[Region]:
     ]
 
 
+def _variants(region: Region) -> list[Region]:
+    """Tighter and turned versions of a region."""
+    return [
+        replace(region, size=0.8 * region.size, angle=region.angle + turn) for turn in (-0.5, 0.0, 0.5)
+    ] + [replace(region, angle=region.angle + turn) for turn in (-0.5, 0.5)]
+
+
 def _is_double(reading: Reading, others: Sequence[Reading]) -> bool:
     """Whether ``reading`` shows the same hand as one of ``others``: landmarks agree or pile up."""
     for other in others:
@@ -188,6 +211,3 @@ def _landmarks(index: int, track: int, reading: Reading) -> HandLandmarks:
         reading.right,
         track,
     )
-
-
-__all__ = ["HandTracker", "TrackerOptions", "replace"]

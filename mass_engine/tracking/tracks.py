@@ -94,7 +94,8 @@ def _parse(data: dict[str, Any], side: str, size: tuple[int, int]) -> Tracks:
     counts = {name: sum(hand["side"] == name for _, hand in rows) for name in ("left", "right")}
     chosen = max(counts, key=lambda name: counts[name]) if side == "auto" else side
     rows = sorted(
-        ((frame, hand) for frame, hand in rows if hand["side"] == chosen), key=lambda row: int(row[0]["index"])
+        ((frame, hand) for frame, hand in rows if hand["side"] == chosen),
+        key=lambda row: int(row[0]["index"]),
     )
     if not rows:
         raise EngineError("tracks.no_hand", f"The tracks hold no {chosen} hand.", "Choose the other --side.")

@@ -1,0 +1,74 @@
+"""Named poses, and poses written as numbers."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from mass_engine.errors import BadArgumentError
+from mass_engine.hand.builtin import joint_frames, load_builtin
+from mass_engine.hand.model import mirror_pose
+from mass_engine.hand.pose import HandPose, Side
+
+#: Degrees of (flexion, abduction, twist) by joint, numbered 1 to 15 in MANO's order; what is not named is 0.
+_Angles = dict[int, tuple[float, float, float]]
+
+_CURLED: _Angles = {
+    4: (82, 0, 0), 5: (100, 0, 0), 6: (60, 0, 0),
+    7: (78, -6, 0), 8: (98, 0, 0), 9: (58, 0, 0),
+    10: (80, -3, 0), 11: (100, 0, 0), 12: (60, 0, 0),
+}  # fmt: skip
+_THUMB_OVER: _Angles = {13: (18, -12, 12), 14: (38, 0, 0), 15: (48, 0, 0)}
+_POSES: dict[str, _Angles] = {
+    "rest": {},
+    "fist": {1: (80, 4, 0), 2: (98, 0, 0), 3: (58, 0, 0), **_CURLED, **_THUMB_OVER},
+    "point": {1: (4, 0, 0), 2: (4, 0, 0), **_CURLED, **_THUMB_OVER},
+    "pinch": {
+        1: (50, 0, 0), 2: (48, 0, 0), 3: (28, 0, 0),
+        4: (26, 0, 0), 5: (24, 0, 0), 6: (12, 0, 0),
+        7: (10, -4, 0), 8: (12, 0, 0), 10: (16, 0, 0), 11: (18, 0, 0),
+        13: (14, -26, 14), 14: (22, 0, 0), 15: (18, 0, 0),
+    },
+    "spread": {1: (-4, 14, 0), 4: (-2, 2, 0), 7: (-4, -16, 0), 10: (-3, -7, 0), 13: (-16, 14, 0), 15: (-8, 0, 0)},
+}  # fmt: skip
+POSE_NAMES: tuple[str, ...] = tuple(_POSES)
+
+_ADVICE = f"Use one of {', '.join(POSE_NAMES)}, frame:N, or 48 comma-separated angles in radians."
+
+
+def named_pose(name: str, side: Side) -> HandPose:
+    """A named pose of the mean hand at the origin. Raises BadArgumentError ``pose.invalid``."""
+    if name not in _POSES:
+        raise BadArgumentError("pose.invalid", f"There is no pose {name[:40]!r}.", _ADVICE)
+    frames = joint_frames(load_builtin("right"))
+    fingers = torch.zeros(15, 3)
+    for joint, degrees in _POSES[name].items():
+        # Angles about the frame's axes add up as one rotation vector.
+        fingers[joint - 1] = torch.tensor(degrees) * (math.pi / 180) @ frames[joint - 1]
+    pose: Tensor = fingers.flatten()
+    rest = HandPose.rest(side)
+    hand_pose = pose if side == "right" else mirror_pose(pose)
+    return HandPose(rest.betas, rest.global_orient, hand_pose, rest.transl, side)
+
+
+def parse_pose(spec: str, side: Side) -> HandPose:
+    """A pose from its name or from 48 numbers (global_orient, then hand_pose; radians).
+
+    Raises BadArgumentError ``pose.invalid``.
+    """
+    text = spec.strip()
+    if text in _POSES:
+        return named_pose(text, side)
+    try:
+        numbers = [float(part) for part in text.split(",")] if "," in text else []
+    except ValueError:
+        numbers = []
+    if len(numbers) != 48:
+        raise BadArgumentError("pose.invalid", f"The pose {text[:40]!r} is not understood.", _ADVICE)
+    if not all(math.isfinite(number) and abs(number) <= 2 * math.pi for number in numbers):
+        raise BadArgumentError("pose.invalid", "A pose angle is not within one turn.", _ADVICE)
+    values = torch.tensor(numbers, dtype=torch.float32)
+    rest = HandPose.rest(side)
+    return HandPose(rest.betas, values[:3], values[3:], rest.transl, side)

@@ -1,0 +1,93 @@
+"""MeshBinding: the fixed, linear map from a posed hand mesh to its attached surfels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mass_engine.hand.model import HandModel
+from mass_engine.surfel.densify import fractal_corners
+from mass_engine.surfel.inellipse import (
+    CONJUGATE,
+    SIGMA_PER_SEMI_AXIS,
+    matrix_to_quat,
+    principal_axes,
+    safe_norm,
+)
+from mass_engine.surfel.subdivision import Subdivision, loop_subdivision
+
+
+@dataclass(frozen=True)
+class AttachedSurfels:
+    """Surfels [...,N] of posed meshes: ``means`` [...,N,3] and ``tangents`` [...,N,2,3], the disk's points
+    being mean + u tangent_0 + v tangent_1 with weight exp(-(u^2 + v^2) / 2); ``normals`` [...,N,3] outward."""
+
+    means: Tensor
+    tangents: Tensor
+    normals: Tensor
+
+    def scales_quats(self) -> tuple[Tensor, Tensor]:
+        """Standard deviations [...,N,2] along the principal axes and their rotation, quats [...,N,4] wxyz."""
+        scales, rotation = principal_axes(self.tangents[..., 0, :], self.tangents[..., 1, :])
+        return scales, matrix_to_quat(rotation)
+
+
+@dataclass(frozen=True)
+class MeshBinding:
+    """Built once for a hand model, ``levels`` of Loop subdivision and a fractal ``depth``.
+
+    Surfel n belongs to face ``surfel_faces[n]`` of the base mesh (``base_faces`` [F,3]) and moves mostly with
+    bone ``bones[n]``. Surfels of one refined face are neighbours: n = face * per_face + place.
+    """
+
+    levels: int
+    depth: int
+    base_faces: Tensor
+    subdivision: Subdivision
+    per_face: int
+    surfel_faces: Tensor
+    bones: Tensor
+    _rows: Tensor  # [3 K,3]: centroid, tangent 0, tangent 1 of each small triangle from a face's corners
+
+    @staticmethod
+    def build(model: HandModel, levels: int, depth: int) -> MeshBinding:
+        """Precompute everything that does not depend on the pose."""
+        subdivision = loop_subdivision(model.faces, len(model.template), levels)
+        corners = fractal_corners(depth)
+        conjugate = torch.tensor(CONJUGATE)
+        conjugate[1:] *= SIGMA_PER_SEMI_AXIS
+        # Tangent order (Q, P): their cross product is the outward normal.
+        rows = (conjugate[[0, 2, 1]] @ corners).reshape(-1, 3)
+        weights = subdivision.apply(model.weights)
+        bones = weights[subdivision.faces].mean(1).argmax(-1)
+        count = len(corners)
+        return MeshBinding(
+            levels,
+            depth,
+            model.faces,
+            subdivision,
+            count,
+            subdivision.face_parent.repeat_interleave(count),
+            bones.repeat_interleave(count),
+            rows,
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of surfels."""
+        return len(self.surfel_faces)
+
+    def surfels(self, vertices: Tensor) -> AttachedSurfels:
+        """Attached surfels of posed base-mesh vertices [...,V,3]; differentiable."""
+        refined = self.subdivision.apply(vertices)
+        triangles = refined[..., self.subdivision.faces, :]
+        lead = triangles.shape[:-3]
+        both = (self._rows @ triangles).reshape(*lead, self.count, 3, 3)
+        a, b, c = triangles.unbind(-2)
+        normals = torch.linalg.cross(b - a, c - a)
+        normals = normals / safe_norm(normals).unsqueeze(-1)
+        # The small triangles of a face lie in its plane.
+        normals = normals.unsqueeze(-2).expand(*lead, -1, self.per_face, 3).reshape(*lead, self.count, 3)
+        return AttachedSurfels(both[..., 0, :], both[..., 1:, :], normals)

@@ -130,12 +130,14 @@ class MassClient:
         poll_seconds: float = 1.0,
         patience: float = 60.0,
     ) -> JobInfo:
-        """Follow the job to its end. A service that is away is waited for, ``patience`` seconds long."""
-        etag, job = "", None
+        """Follow the job to its end. A service that goes away is waited for, ``patience`` seconds long."""
+        response = self._request("GET", _path(job_id))
+        etag, job = response.headers.get("etag", ""), _job(response.json())
+        if on_update is not None:
+            on_update(job)
         last_answer = time.monotonic()
-        while job is None or not job.finished:
-            if job is not None or etag:
-                time.sleep(poll_seconds)
+        while not job.finished:
+            time.sleep(poll_seconds)
             try:
                 response = self._request(
                     "GET", _path(job_id), headers={"If-None-Match": etag} if etag else {}
@@ -144,7 +146,6 @@ class MassClient:
                 away = error.status == 0 or error.status >= 500
                 if not away or time.monotonic() - last_answer > patience:
                     raise
-                time.sleep(poll_seconds)
                 continue
             last_answer = time.monotonic()
             if response.status_code == 304:

@@ -23,6 +23,8 @@ from types import TracebackType
 from typing import Self
 
 import redis
+from redis.backoff import NoBackoff
+from redis.retry import Retry
 
 from service.processes import Backoff, launch, stop_group
 
@@ -156,7 +158,8 @@ class EmbeddedBroker:
 
     def ping(self) -> bool:
         """Whether the server answers now."""
-        client = redis.Redis(unix_socket_path=str(self.socket), socket_timeout=2.0)
+        once = Retry(NoBackoff(), 0)  # by default a refusal is met with seconds of retries
+        client = redis.Redis(unix_socket_path=str(self.socket), socket_timeout=2.0, retry=once)
         try:
             return bool(client.ping())
         except redis.RedisError:

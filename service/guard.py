@@ -1,8 +1,9 @@
-"""What every request and response passes: Host and Origin checks, and protective headers."""
+"""What every request and response passes: Host and Origin checks, protective headers, the last resort."""
 
 from __future__ import annotations
 
 import ipaddress
+import logging
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -10,6 +11,8 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.problems import Kind, ProblemError, ProblemResponse
+
+log = logging.getLogger(__name__)
 
 _SAFE = {"GET", "HEAD", "OPTIONS"}
 _PAGE_POLICY = (
@@ -44,8 +47,12 @@ class Guard:
         headers = Headers(scope=scope)
         policy = _DOCS_POLICY if scope["path"] == "/docs" else _PAGE_POLICY
 
+        started = False
+
         async def protected(message: Message) -> None:
+            nonlocal started
             if message["type"] == "http.response.start":
+                started = True
                 out = MutableHeaders(scope=message)
                 out.setdefault("x-content-type-options", "nosniff")
                 out.setdefault("referrer-policy", "no-referrer")
@@ -55,11 +62,19 @@ class Guard:
 
         kind = self._refusal(scope["method"], headers)
         if kind is None:
-            await self._app(scope, receive, protected)
-        else:
-            problem = ProblemError(kind)
-            problem.unread = "content-length" in headers or "transfer-encoding" in headers
-            await ProblemResponse(Request(scope), problem)(scope, receive, protected)
+            try:
+                await self._app(scope, receive, protected)
+                return
+            except Exception as error:
+                # Left to the framework, this would reach the server, which then drops the connection.
+                if started:
+                    raise
+                log.error("%s %s failed", scope["method"], scope["path"], exc_info=error)
+                kind = Kind.INTERNAL
+        problem = ProblemError(kind)
+        has_body = "content-length" in headers or "transfer-encoding" in headers
+        problem.unread = has_body and kind is not Kind.INTERNAL
+        await ProblemResponse(Request(scope), problem)(scope, receive, protected)
 
     def _refusal(self, method: str, headers: Headers) -> Kind | None:
         host = headers.get("host", "")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import defaultdict
 from enum import Enum
 from typing import Any
@@ -16,8 +15,6 @@ from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
 MEDIA_TYPE = "application/problem+json"
-
-log = logging.getLogger(__name__)
 
 
 class Kind(Enum):
@@ -299,11 +296,10 @@ def field_errors(errors: Any) -> list[dict[str, str]]:
 
 
 def install(app: FastAPI) -> None:
-    """Make every error of ``app`` a problem."""
+    """Make every error of ``app`` a problem; bugs are left to the guard."""
     app.add_exception_handler(ProblemError, _on_problem)
     app.add_exception_handler(HTTPException, _on_http)
     app.add_exception_handler(RequestValidationError, _on_invalid)
-    app.add_exception_handler(Exception, _on_bug)
 
 
 async def _on_problem(request: Request, error: Exception) -> ProblemResponse:
@@ -323,8 +319,3 @@ async def _on_http(request: Request, error: Exception) -> ProblemResponse:
 async def _on_invalid(request: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, RequestValidationError)
     return ProblemResponse(request, ProblemError(Kind.REQUEST_INVALID, errors=field_errors(error.errors())))
-
-
-async def _on_bug(request: Request, error: Exception) -> ProblemResponse:
-    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return ProblemResponse(request, ProblemError(Kind.INTERNAL))

@@ -19,6 +19,13 @@ def pulse_path(data_dir: Path, pid: int | None = None, host: str | None = None) 
     return data_dir / "run" / name
 
 
+def sweep_pulses(data_dir: Path, older_than: float = 24 * 3600.0) -> None:
+    """Remove the files of workers long dead (in containers, every start has a new name)."""
+    for path in (data_dir / "run").glob("worker-*.alive"):
+        if not is_fresh(path, older_than):
+            path.unlink(missing_ok=True)
+
+
 def is_fresh(path: Path, max_age: float = PULSE_MAX_AGE) -> bool:
     """Whether the file was touched in the last ``max_age`` seconds."""
     try:

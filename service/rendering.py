@@ -76,8 +76,11 @@ def load_avatar(path: Path) -> Renderer:
 
 
 def warm_engine() -> None:
-    """Import the engine ahead of the first request."""
-    import mass_engine  # noqa: F401
+    """Import the engine ahead of the first request; if that fails, each request will say so."""
+    try:
+        from mass_engine import Avatar  # noqa: F401
+    except ImportError:
+        log.exception("the engine cannot be imported")
 
 
 class RenderPool:

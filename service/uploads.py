@@ -74,15 +74,15 @@ async def receive_form(
                 break
             await run_in_threadpool(form.guarded, partial(form.feed, chunk))
         return await run_in_threadpool(form.guarded, form.finish)
-    except ProblemError as problem:
-        problem.unread = chunk is not None
+    except ProblemError as refusal:
+        refusal.unread = chunk is not None
         raise
     except ClientDisconnect as error:
         raise ProblemError(Kind.UPLOAD_INCOMPLETE) from error
     except TimeoutError as error:
-        problem = ProblemError(Kind.UPLOAD_STALLED)
-        problem.unread = True
-        raise problem from error
+        stalled = ProblemError(Kind.UPLOAD_STALLED)
+        stalled.unread = True
+        raise stalled from error
     finally:
         form.close()
 

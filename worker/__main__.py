@@ -19,6 +19,9 @@ def main() -> int:
         format="%(asctime)s worker[%(process)d] %(levelname)s %(message)s",
         stream=sys.stderr,
     )
+    # Our own lines say what happens to jobs.
+    for name in ("celery.worker.strategy", "celery.app.trace"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     # The warning is about messages that carry code, which root must not run; only JSON is accepted here.
     warnings.simplefilter("ignore", SecurityWarning)
     return run_worker(Settings())

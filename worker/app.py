@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from celery import Celery, bootsteps, signals
+from kombu.entity import Queue
 
 from service.jobs.store import create_store
-from service.pulse import PULSE_SECONDS, pulse_path
+from service.pulse import PULSE_SECONDS, pulse_path, sweep_pulses
 from service.queue import create_celery, create_queue
 from service.settings import Settings
 from service.storage import create_storage
@@ -28,12 +29,23 @@ log = logging.getLogger(__name__)
 
 #: How long the reconciler may take to finish its round at the end.
 _RECONCILER_GRACE = 10.0
+#: How soon after a job the next one is asked for.
+_LOOK_SECONDS = 0.2
 
 
 def create_app(settings: Settings, supervisor: Supervisor) -> Celery:
-    """The consuming end of the queue, with the task and the sign of life."""
+    """The consuming end of the queue, with the task and the sign of life.
+
+    Messages are taken for good, not held until acknowledged. The row and its lease already bring back what a
+    dying worker had; an unacknowledged message would add nothing but a copy to be delivered hours later, and
+    a way to get stuck: when the broker restarts during a job, the acknowledgement fails, is not repeated, and
+    the full prefetch window keeps the worker from ever asking for another job.
+    """
     app = create_celery(settings)
     app.conf.update(
+        task_queues=(Queue(settings.queue_name, no_ack=True),),  # type: ignore[no-untyped-call]
+        task_acks_late=False,
+        worker_disable_prefetch=True,  # ask for a job only when there is a thread for it
         worker_pool="threads",
         worker_max_tasks_per_child=None,
         worker_enable_remote_control=False,  # jobs are cancelled through their row
@@ -80,6 +92,10 @@ def run_worker(settings: Settings) -> int:
     return int(worker.exitcode or 0)
 
 
+def _nothing() -> None:
+    """The turn of the event loop is the point."""
+
+
 def _pulse_step(path: Path) -> type[Any]:
     """A part of the worker that touches ``path`` from the event loop, so only while that loop turns."""
 
@@ -88,11 +104,17 @@ def _pulse_step(path: Path) -> type[Any]:
 
         def start(self, worker: Any) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
+            sweep_pulses(path.parent.parent)
             worker.timer.call_after(0.0, path.touch)
-            self._timer = worker.timer.call_repeatedly(PULSE_SECONDS, path.touch)
+            self._timers = [
+                worker.timer.call_repeatedly(PULSE_SECONDS, path.touch),
+                # Nothing wakes the loop when the pool's thread is done; so it looks whether to ask for a job.
+                worker.timer.call_repeatedly(_LOOK_SECONDS, _nothing),
+            ]
 
         def stop(self, _worker: Any) -> None:
-            self._timer.cancel()
+            for timer in self._timers:
+                timer.cancel()
             path.unlink(missing_ok=True)
 
     return Pulse

@@ -42,7 +42,7 @@ _EXIT_BAD_INPUT = 3
 class Outcome(StrEnum):
     """How a worker's dealing with one message ended."""
 
-    REFUSED = "refused"  # the worker is stopping: the message is for another
+    REFUSED = "refused"  # the worker is stopping: the message was passed on
     SKIPPED = "skipped"  # nothing to do: somebody else has the job, or it is over
     SUCCEEDED = "succeeded"
     FAILED = "failed"
@@ -119,6 +119,7 @@ class Supervisor:
     def run(self, job_id: str) -> Outcome:
         """Do the job if it can be claimed. Raises only when the database cannot be reached."""
         if self._stopping.is_set():
+            self._queue.publish(job_id)
             return Outcome.REFUSED
         since = self._clock()
         claim = self._store.claim(job_id, lease_seconds=self._settings.lease_seconds)

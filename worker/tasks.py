@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from celery import Celery
-from celery.exceptions import Reject
 
 from service.queue import TASK
-from worker.supervisor import Outcome, Supervisor
+from worker.supervisor import Supervisor
 
 
 def register(app: Celery, supervisor: Supervisor) -> None:
-    """Give ``app`` the task. A message about a job that is taken, over or unknown is simply acknowledged."""
+    """Give ``app`` the task. A message about a job that is taken, over or unknown does nothing."""
 
     @app.task(name=TASK, ignore_result=True)  # type: ignore[untyped-decorator]
     def reconstruct(job_id: str) -> None:
-        if supervisor.run(job_id) is Outcome.REFUSED:
-            raise Reject("this worker is stopping", requeue=True)
+        supervisor.run(job_id)

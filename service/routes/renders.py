@@ -59,7 +59,7 @@ def render_job(
         str,
         Query(
             max_length=200,
-            description="`source` (the camera of the video), or `orbit:YAW,PITCH` around the hand in degrees, "
+            description="`source` (the camera of the video), or `orbit:YAW,PITCH` around the hand, degrees, "
             "at a distance that fits it into the picture; `orbit:YAW,PITCH,DISTANCE` names it in metres.",
         ),
     ] = "orbit:0,0",

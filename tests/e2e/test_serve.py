@@ -1,4 +1,4 @@
-"""``mass serve`` and the ``mass`` command as real processes: the whole service, with a stand-in for the engine."""
+"""``mass serve`` and the ``mass`` command as real processes: the whole service, but for the engine."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ import psutil
 import pytest
 
 from service.client import JobInfo, MassClient, ServiceError
+from service.processes import launch
 from tests.worker.fake_engine import FILES
 from tests.worker.harness import DEADLINE, FAKE_ENGINE, REPOSITORY, alive, wait_for
 
@@ -32,7 +33,7 @@ class Served:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.data = root / "data"
-        self.output = root / "serve.log"
+        self.output = root / f"serve-{len([*root.glob('serve-*')])}.log"
         clean = {name: value for name, value in os.environ.items() if not name.startswith("MASS_")}
         self.environment = {
             **clean,
@@ -43,14 +44,13 @@ class Served:
             "MASS_RECONCILE_SECONDS": "0.5",
             "MASS_REPUBLISH_MIN_SECONDS": "1",
         }
-        with self.output.open("ab") as output:
-            self.process = subprocess.Popen(
+        with self.output.open("wb") as output:
+            self.process = launch(
                 [*MASS, "serve", "--port", "0", "--data-dir", str(self.data)],
                 cwd=REPOSITORY,
                 env=self.environment,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,
             )
         line = wait_for("it says that it is ready", self._ready_line, 2 * DEADLINE)
         self.url = line.group(1)
@@ -68,7 +68,7 @@ class Served:
             for process in psutil.Process(self.process.pid).children():
                 try:
                     if words in " ".join(process.cmdline()):
-                        return process.pid
+                        return int(process.pid)
                 except psutil.Error:
                     continue
             return None
@@ -156,11 +156,10 @@ def test_each_part_is_started_again_when_it_is_killed(served: Served) -> None:
     with MassClient(served.url) as client:
         job = client.submit(served.video(gated=True))
         wait_for("the engine has started", served.starts)
-        for words in ("-m worker", "service.cli api", "valkey-server"):
-            pid = served.child(words if words != "valkey-server" else "broker.sock")
+        for words in ("-m worker", "service.cli api", "broker.sock"):
+            pid = served.child(words)
             os.kill(pid, signal.SIGKILL)
-            wait_for(f"{words} is gone", lambda pid=pid: not alive(pid))  # type: ignore[misc]
-            served.child(words if words != "valkey-server" else "broker.sock")
+            wait_for(f"{words} runs again", lambda words=words, pid=pid: served.child(words) != pid)  # type: ignore[misc]
         (served.root / "gate").touch()
         job = client.wait(job.id, poll_seconds=0.1)
         assert (job.state, job.attempt) == ("succeeded", 2)

@@ -154,6 +154,16 @@ def test_a_job_whose_workers_keep_dying_fails_with_advice(store: JobStore, clock
     assert found.finished_at == clock.now
 
 
+def test_an_expired_lease_can_be_taken_over_only_while_attempts_are_left(
+    store: JobStore, clock: Clock
+) -> None:
+    job = store.create({}, "v")
+    for attempt in (1, 2):
+        assert claimed(store, job.id).attempt == attempt
+        clock.now += 61
+    assert store.claim(job.id) is None
+
+
 def test_a_crashed_engine_costs_an_attempt_and_an_orderly_stop_does_not(store: JobStore) -> None:
     job = store.create({}, "v")
     for _ in range(5):
@@ -173,7 +183,13 @@ def test_progress_never_falls_within_an_attempt_and_starts_again_with_the_next(s
     job = store.create({}, "v")
     claim = claimed(store, job.id)
     for fraction in (0.2, 0.1, 0.7, 0.5, 3.0):
+        before = store.get(job.id)
+        assert before is not None
         assert store.report_progress(job.id, claim.token, f"s{fraction}", fraction, 5.0, "m")
+        found = store.get(job.id)
+        assert found is not None
+        assert found.fraction == max(before.fraction, min(fraction, 1.0))
+        assert (found.stage == f"s{fraction}") == (fraction > before.fraction)
     found = store.get(job.id)
     assert found is not None
     assert (found.fraction, found.stage, found.time_left, found.message) == (1.0, "s3.0", 5.0, "m")

@@ -139,4 +139,4 @@ class JobLife(RuleBasedStateMachine):
 
 
 TestJobLife = JobLife.TestCase
-TestJobLife.settings = hypothesis_settings(max_examples=25, stateful_step_count=30, deadline=None)
+TestJobLife.settings = hypothesis_settings(max_examples=60, stateful_step_count=30, deadline=None)

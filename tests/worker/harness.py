@@ -20,6 +20,7 @@ import redis
 from service.embedded import EmbeddedBroker
 from service.jobs.model import Job, new_job_id
 from service.jobs.store import create_store
+from service.processes import launch
 from service.pulse import is_fresh, pulse_path
 from service.queue import create_queue
 from service.settings import Settings
@@ -59,13 +60,12 @@ class Worker:
         self._settings = settings
         self._log = log
         with log.open("wb") as output:
-            self.process = subprocess.Popen(
+            self.process = launch(
                 [sys.executable, "-m", "worker"],
                 cwd=REPOSITORY,
                 env=environment,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,
             )
 
     @property

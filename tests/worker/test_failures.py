@@ -92,6 +92,21 @@ def test_sigterm_of_the_only_worker_leaves_the_job_queued_for_the_next(bench: Be
     bench.until(job_id, "succeeded")
 
 
+def test_a_busy_worker_leaves_messages_for_others() -> None:
+    bench = Bench(republish_min_seconds=600.0)  # no second message helps
+    try:
+        bench.worker().ready()
+        long, short = bench.submit(gated=True), bench.submit()
+        bench.engine(long)
+        bench.worker().ready()
+        bench.until(short, "succeeded")
+        assert bench.row(long).state is JobState.RUNNING
+        bench.open_gate(long)
+        bench.until(long, "succeeded")
+    finally:
+        bench.close()
+
+
 def test_a_queue_wiped_clean_is_refilled_from_the_table(bench: Bench) -> None:
     jobs = [bench.submit() for _ in range(3)]
     client = bench.broker_client()

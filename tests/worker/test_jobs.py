@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from service.jobs.store import Cancel
 from tests.worker.fake_engine import FILES
-from tests.worker.harness import Bench, alive, wait_for
+from tests.worker.harness import DEADLINE, REPOSITORY, Bench, alive, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +138,20 @@ def test_twenty_messages_about_one_job_are_one_run(running: Bench) -> None:
     after = running.submit()
     running.until(after, "succeeded")
     assert len(running.starts(job_id)) == 1
+
+
+def test_the_health_command_tells_a_live_worker_from_none(running: Bench) -> None:
+    def health(data_dir: Path) -> subprocess.CompletedProcess[str]:
+        environment = {**running.environment(), "MASS_DATA_DIR": str(data_dir)}
+        command = [sys.executable, "-m", "worker.health"]
+        return subprocess.run(
+            command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=DEADLINE
+        )
+
+    alive = health(running.settings.data_dir)
+    assert alive.returncode == 0
+    assert str(running.workers[0].process.pid) in alive.stdout
+    assert health(running.root / "elsewhere").returncode == 1
 
 
 def test_a_message_about_no_job_is_dropped(running: Bench) -> None:

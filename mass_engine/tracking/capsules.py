@@ -52,7 +52,8 @@ class CapsuleHand:
     """The rough hand in an image window of [h,w] pixels, at ``scale`` pixels per mm.
 
     ``distance`` mm to its outline, negative inside; ``along`` mm from the wrist down the forearm (negative
-    towards the fingers) and ``across`` mm from the forearm's axis; ``forearm`` bool, the corridor beyond the wrist.
+    towards the fingers) and ``across`` mm from the forearm's axis; ``forearm`` bool, a corridor beyond the
+    wrist.
     """
 
     distance: NDArray[np.float32]

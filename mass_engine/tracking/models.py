@@ -153,7 +153,7 @@ class Network:
         self._outputs = {str(d["name"]): int(d["index"]) for d in self._interpreter.get_output_details()}
 
     def __call__(self, image: NDArray[np.uint8], names: Sequence[str]) -> list[NDArray[np.float32]]:
-        """Run on ``image`` uint8 [S,S,3] RGB (scaled to 0..1 here); returns the named outputs, batch removed."""
+        """Run on ``image`` uint8 [S,S,3] RGB, scaled to 0..1 here; the named outputs, batch axis removed."""
         batch = (image.astype(np.float32) * np.float32(1 / 255))[None]
         self._interpreter.set_tensor(self._input, batch)
         self._interpreter.invoke()

@@ -16,7 +16,7 @@ def wrap_angle(angle: float) -> float:
 
 
 def upward_angle(origin: NDArray[np.floating], target: NDArray[np.floating]) -> float:
-    """The clockwise turn (radians) of the direction ``origin`` -> ``target`` (pixels, y down) from straight up."""
+    """Radians clockwise from straight up to the direction ``origin`` -> ``target`` (pixels, y down)."""
     dx, dy = (float(v) for v in target - origin)
     return wrap_angle(math.atan2(dx, -dy))
 

@@ -56,7 +56,8 @@ def hand_box(
 
 @dataclass(frozen=True)
 class _Window:
-    """A hand cut out of its frame at working size: ``lab`` uint8 [h,w,3], ``rgb``, and its rough hand."""
+    """A hand cut out of its frame at working size: ``rgb`` uint8 [h,w,3], its colour ``bins`` [h,w], the
+    rough ``hand``; ``box`` is where it came from, in full-image pixels."""
 
     box: tuple[int, int, int, int]
     rgb: NDArray[np.uint8]
@@ -71,8 +72,8 @@ _BINS = (32, 64, 64)
 
 def _bins(rgb: NDArray[np.uint8]) -> NDArray[np.int32]:
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab).astype(np.int32)
-    l, a, b = (lab[..., i] >> _SHIFTS[i] for i in range(3))
-    return np.asarray((l * _BINS[1] + a) * _BINS[2] + b, np.int32)
+    light, red, yellow = (lab[..., i] >> _SHIFTS[i] for i in range(3))
+    return np.asarray((light * _BINS[1] + red) * _BINS[2] + yellow, np.int32)
 
 
 def _window(rgb: NDArray[np.uint8], landmarks: HandLandmarks) -> _Window:
@@ -105,10 +106,13 @@ class HandSegmenter:
 
     @staticmethod
     def train(samples: Sequence[tuple[NDArray[np.uint8], HandLandmarks]]) -> HandSegmenter:
-        """Learn hand, sleeve and background colours from (upright frame, landmarks) pairs; 10 to 30 spread ones do.
+        """Learn hand, sleeve and background colours from (upright frame, landmarks) pairs.
 
-        Colours under the rough hand come first, then colours weighted by the previous model's belief.
+        10 to 30 pairs, spread over the clip, are enough. Colours under the rough hand come first, then
+        colours weighted by the previous model's belief.
         """
+        if not samples:
+            raise ValueError("a colour model needs at least one frame with landmarks")
         windows = [_window(rgb, landmarks) for rgb, landmarks in samples]
         colors: ColorModel | None = None
         for _ in range(_ROUNDS):
@@ -137,10 +141,9 @@ class HandSegmenter:
     def __call__(self, rgb: NDArray[np.uint8], landmarks: HandLandmarks) -> HandMask:
         """Label the window around ``landmarks`` in the upright frame ``rgb`` uint8 [H,W,3]."""
         window = _window(rgb, landmarks)
-        belief = self._colors.hand[window.bins] + _prior(window.hand.distance)
-        belief = cv2.GaussianBlur(belief, (0, 0), 1.0)
+        belief = _smooth(self._colors.hand[window.bins] + _prior(window.hand.distance))
         sleeve = _sleeved(self._colors, window)
-        ignore = window.hand.forearm | sleeve
+        ignore = window.hand.forearm | sleeve | _bare_arm(self._colors, window)
         mask = _connected(_cut(window, belief, ignore) & ~sleeve, window.hand)
         _, _, w, h = window.box
         soft = cv2.resize(mask.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
@@ -150,17 +153,29 @@ class HandSegmenter:
         return HandMask(window.box, labels)
 
 
+def _bare_arm(colors: ColorModel, window: _Window) -> NDArray[np.bool_]:
+    """Skin beyond the wrist that a bent wrist puts outside the forearm's corridor."""
+    rough = window.hand
+    score = _smooth(colors.hand[window.bins])
+    return np.asarray((rough.along > 5.0) & (rough.distance > 12.0) & (score > 1.0))
+
+
 def _sleeved(colors: ColorModel, window: _Window) -> NDArray[np.bool_]:
     """Pixels of a sleeve that reaches over the wrist: its colour, near the wrist, joined to the forearm."""
     rough = window.hand
-    near = (rough.along > _CUFF) & (rough.across < 45.0 + 0.35 * np.maximum(rough.along, 0))
-    score = cv2.GaussianBlur(colors.sleeve[window.bins], (0, 0), 1.0)
-    alike = (near & (score > 0.5)).astype(np.uint8)
-    alike = cv2.morphologyEx(alike, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    corridor = (rough.along > _CUFF) & (rough.across < 45.0 + 0.35 * np.maximum(rough.along, 0))
+    near = corridor | (rough.distance < 10.0)
+    score = _smooth(colors.sleeve[window.bins])
+    square = np.ones((3, 3), np.uint8)
+    alike = cv2.morphologyEx((near & (score > 0.5)).astype(np.uint8), cv2.MORPH_OPEN, square)
     count, pieces = cv2.connectedComponents(alike, connectivity=4)
     reaches = np.bincount(pieces[rough.along > 0], minlength=count) > 0
     reaches[0] = False
     return np.asarray(reaches[pieces])
+
+
+def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), 1.0), np.float32)
 
 
 def _prior(distance: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -192,7 +207,7 @@ def _blur_axis(cube: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
     moved = np.moveaxis(cube, axis, 0)
     flat = np.ascontiguousarray(moved.reshape(moved.shape[0], -1))
     blurred = cv2.GaussianBlur(flat, (1, 5), sigmaX=1e-3, sigmaY=1.0, borderType=cv2.BORDER_REPLICATE)
-    return np.moveaxis(blurred.reshape(moved.shape), 0, axis)
+    return np.moveaxis(np.asarray(blurred, np.float64).reshape(moved.shape), 0, axis)
 
 
 def _cut(window: _Window, belief: NDArray[np.float32], ignore: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -207,7 +222,8 @@ def _cut(window: _Window, belief: NDArray[np.float32], ignore: NDArray[np.bool_]
         return np.asarray(belief > 0)
     none: NDArray[np.float64] = np.zeros((1, 65))
     cv2.setRNGSeed(0)
-    cv2.grabCut(window.rgb, mask, None, none, none.copy(), 1, cv2.GC_INIT_WITH_MASK)
+    whole = (0, 0, mask.shape[1], mask.shape[0])  # not used with a mask
+    cv2.grabCut(window.rgb, mask, whole, none, none.copy(), 1, cv2.GC_INIT_WITH_MASK)
     return np.asarray((mask == cv2.GC_FGD) | (mask == cv2.GC_PR_FGD))
 
 

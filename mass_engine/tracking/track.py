@@ -83,13 +83,13 @@ class TrackBuilder:
 def track_main_hand(
     frames: Iterable[Frame],
     networks: HandNetworks,
-    is_heldout: Callable[[int], bool] = lambda index: False,
+    is_heldout: Callable[[int], bool] | None = None,
     options: TrackerOptions | None = None,
 ) -> Track:
     """Follow the main hand through ``frames``, keeping no image. See :class:`TrackBuilder`."""
     builder = TrackBuilder(networks, options)
     for frame in frames:
-        builder.add(frame, is_heldout(frame.index))
+        builder.add(frame, is_heldout is not None and is_heldout(frame.index))
     return builder.finish()
 
 
@@ -103,8 +103,8 @@ def main_hand(
     """Choose the main hand among all ``found`` hands by frame, vote on its side, mark its outliers."""
     held = frozenset(heldout)
     runs: dict[int, dict[int, HandLandmarks]] = {}
-    for index, hands in found.items():
-        for hand in hands if index not in held else ():
+    for index, seen in found.items():
+        for hand in seen if index not in held else ():
             runs.setdefault(hand.track, {})[index] = hand
     chosen = _choose(runs)
     hands = {i: h for track in chosen for i, h in runs[track].items()}
@@ -194,7 +194,7 @@ def _jump(hand: HandLandmarks, others: Mapping[int, HandLandmarks]) -> float:
 def _bone_lengths(hand: HandLandmarks) -> NDArray[np.float64]:
     parents, children = (list(side) for side in zip(*BONES, strict=True))
     lengths = np.linalg.norm(hand.world[children] - hand.world[parents], axis=1).astype(np.float64)
-    return np.maximum(lengths, 1e-4)
+    return np.asarray(np.maximum(lengths, 1e-4), np.float64)
 
 
 def _outliers(hands: Mapping[int, HandLandmarks]) -> set[int]:

@@ -18,9 +18,10 @@ from mass_engine.tracking.region import Region
 class TrackerOptions:
     """Thresholds on the networks' scores, and how much is searched.
 
-    ``keep`` presence to go on following a hand; ``doubt`` presence below which its reading is not used to look again; ``accept`` presence to begin; ``palm_floor`` lowest palm
-    score worth a look; ``max_hands`` followed at once; ``look_every`` frames between looks for a further
-    hand; ``recrop`` region change above which a frame is read a second time.
+    ``keep`` presence to go on following a hand; ``doubt`` presence below which a reading is no guide;
+    ``accept`` presence to begin; ``palm_floor`` lowest palm score worth a look, ``max_candidates`` of
+    them at once; ``max_hands`` followed at once; ``look_every`` frames between looks for a further hand;
+    ``recrop`` region change above which a frame is read a second time.
     """
 
     keep: float = 0.5
@@ -160,9 +161,11 @@ def _views(height: int, width: int) -> list[View]:
         columns, rows = (max(1, round(1.6 * (side - size) / size)) + 1 for side in (width, height))
         if size == short:
             columns, rows = (1 if side == short else n for side, n in ((width, columns), (height, rows)))
-        for y in np.linspace(0, height - size, rows):
-            for x in np.linspace(0, width - size, columns):
-                views.append(View(float(x), float(y), float(size)))
+        views += [
+            View(float(x), float(y), float(size))
+            for y in np.linspace(0, height - size, rows)
+            for x in np.linspace(0, width - size, columns)
+        ]
     return views
 
 

@@ -26,15 +26,14 @@ def to_rgb(picture: av.VideoFrame) -> NDArray[np.uint8]:
     """``picture`` as uint8 [H,W,3] RGB in the picture's own (coded) orientation."""
     transfer = int(picture.color_trc or 0)
     if transfer not in (_PQ, _HLG):
-        rgb: NDArray[np.uint8] = picture.to_ndarray(format="rgb24")
-        return rgb
+        return np.asarray(picture.to_ndarray(format="rgb24"), np.uint8)
     wide = picture.to_ndarray(format="rgb48le")
     linear = _linear_table(transfer)[wide]
     if int(picture.color_primaries or 0) == _BT2020:
         linear = cv2.transform(linear, _TO_BT709)
     # The output curve is tabulated over the square root of light, which is fine enough in the shadows.
     position = np.sqrt(np.clip(linear, 0.0, _TABLE_MAX)) * ((_TABLE_SIZE - 1) / _TABLE_MAX**0.5)
-    return _display_table()[position.astype(np.int32)]
+    return np.asarray(_display_table()[position.astype(np.int32)], np.uint8)
 
 
 _TABLE_SIZE = 8192

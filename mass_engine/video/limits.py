@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class VideoLimits:
-    """Caps on one file: size in bytes, pixels of one frame, decoded frames, seconds from first to last frame."""
+    """Caps on one file: its bytes, the pixels of one frame, decoded frames, seconds from first to last."""
 
     max_bytes: int = 2_000_000_000
     max_pixels: int = 4096 * 2304

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import av
 import numpy as np
+from av.sidedata.sidedata import SideDataContainer
 from av.sidedata.sidedata import Type as SideDataType
 from numpy.typing import NDArray
 
@@ -20,12 +22,15 @@ class Orientation:
 
     @staticmethod
     def of(picture: av.VideoFrame) -> Orientation:
-        """The orientation stored with a decoded picture; other angles are taken to the nearest quarter turn."""
-        data = picture.side_data.get(SideDataType.DISPLAYMATRIX)
-        if data is None:
-            return Orientation()
-        matrix = np.frombuffer(bytes(data), np.int32)
-        return Orientation.from_matrix(matrix) if matrix.size == 9 else Orientation()
+        """The orientation stored with a decoded picture, to the nearest quarter turn."""
+        # The stubs know a mapping of named entries only.
+        container = cast(SideDataContainer, picture.side_data)
+        for position in range(len(container)):
+            data = container[position]
+            if data.type == SideDataType.DISPLAYMATRIX:
+                matrix = np.frombuffer(bytes(data), np.int32)
+                return Orientation.from_matrix(matrix) if matrix.size == 9 else Orientation()
+        return Orientation()
 
     @staticmethod
     def from_matrix(matrix: NDArray[np.int32]) -> Orientation:

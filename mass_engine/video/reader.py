@@ -72,7 +72,7 @@ def probe(path: str | os.PathLike[str], limits: VideoLimits | None = None) -> Vi
         if first is None:
             raise corrupt("no picture could be decoded")
         orientation = Orientation.of(first)
-        height, width = orientation.size(*_square_size(first))
+        height, width = orientation.size(*_square_size(first, stream))
         codec = stream.codec_context.name
         return VideoInfo(width, height, frames, fps, duration, codec, orientation.degrees)
 
@@ -86,7 +86,7 @@ def read_frames(
 
     A damaged or cut file yields what decodes; ``on_warning`` hears of it at the end. Raises EngineError
     with a code ``video.*``: ``not_found``, ``empty``, ``too_large``, ``unsupported_container``, ``corrupt``,
-    ``no_video_track``, ``too_many_pixels``, ``too_long``, ``size_changes``, ``too_short`` (fewer than two frames).
+    ``no_video_track``, ``too_many_pixels``, ``too_long``, ``size_changes``, ``too_short`` (a single frame).
     """
     limits = limits or VideoLimits()
     with open_container(path, limits) as container:
@@ -105,7 +105,7 @@ def read_frames(
             time = stamp - start if index == 0 or stamp - start > time else time + step
             if index >= limits.max_frames or time > limits.max_seconds:
                 raise _too_long(limits)
-            rgb = _upright(picture)
+            rgb = _upright(picture, stream)
             if shape is not None and rgb.shape != shape:
                 raise EngineError(
                     "video.size_changes",
@@ -175,18 +175,18 @@ def _decode(
             yield picture
 
 
-def _upright(picture: av.VideoFrame) -> NDArray[np.uint8]:
+def _upright(picture: av.VideoFrame, stream: VideoStream) -> NDArray[np.uint8]:
     rgb = to_rgb(picture)
-    height, width = _square_size(picture)
+    height, width = _square_size(picture, stream)
     if rgb.shape[:2] != (height, width):
-        rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
+        rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
     return Orientation.of(picture).apply(rgb)
 
 
-def _square_size(picture: av.VideoFrame) -> tuple[int, int]:
+def _square_size(picture: av.VideoFrame, stream: VideoStream) -> tuple[int, int]:
     """(height, width) with square pixels, before rotation: anamorphic video is widened."""
-    ratio = picture.sample_aspect_ratio if hasattr(picture, "sample_aspect_ratio") else None
-    if not ratio or ratio == 1 or not Fraction(1, 4) <= ratio <= 4:
+    ratio = stream.sample_aspect_ratio
+    if not ratio or not Fraction(1, 4) <= ratio <= 4:
         return picture.height, picture.width
     return picture.height, max(1, round(picture.width * float(ratio)))
 

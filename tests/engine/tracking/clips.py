@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mass_engine.hand.pose import Side
 from mass_engine.tracking.landmarks import HandLandmarks
 from mass_engine.video.reader import Frame, read_frames
 
@@ -54,7 +55,7 @@ def truth_mask(name: str, index: int) -> NDArray[np.bool_]:
 
 
 def open_hand(x: float = 160.0, y: float = 200.0, scale: float = 1.0) -> NDArray[np.float32]:
-    """21 points of a flat right hand seen from the back, fingers up, wrist at (x, y), ``scale`` pixels a mm."""
+    """21 points of a flat right hand from the back, fingers up, wrist at (x, y), ``scale`` pixels a mm."""
     fingers = {  # direction in degrees from up, then distances from the wrist in mm
         "index": (-14, (88, 128, 150, 170)),
         "middle": (-2, (84, 129, 155, 176)),
@@ -77,5 +78,5 @@ def landmarks(
 ) -> HandLandmarks:
     """``points`` as a reading of the tracker, with plausible depth."""
     world = np.concatenate([(points - points.mean(0)) / 1000, np.zeros((21, 1), np.float32)], 1)
-    side = "right" if right >= 0.5 else "left"
+    side: Side = "right" if right >= 0.5 else "left"
     return HandLandmarks(index, side, points, world.astype(np.float32), 0.95, right, track)

@@ -93,8 +93,10 @@ def test_a_held_out_frame_takes_the_new_hand_only_where_the_main_one_should_be()
     assert 7 not in choose(found, 20, {7}).hands
 
 
-@pytest.mark.parametrize(("tracked", "frames", "fails"), [(4, 40, True), (5, 40, False), (3, 3, False),
-                                                          (11, 120, True), (12, 120, False), (30, 2000, False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("tracked", "frames", "fails"),
+    [(4, 40, True), (5, 40, False), (3, 3, False), (11, 120, True), (12, 120, False), (30, 2000, False)],
+)
 def test_how_many_frames_are_enough(tracked: int, frames: int, fails: bool) -> None:
     found = {i: [landmarks(open_hand(), i)] for i in range(tracked)}
     if not fails:

@@ -1,16 +1,16 @@
 """How well the built-in hand takes the shape of a hand it was not made from.
 
-``python benchmarks/hand_truth.py CLIP_DIR... [--frames 12]`` fits one shape and a pose per frame to the ground-truth
-surfaces in CLIP_DIR/truth.npz (vertices [T,V,3] world metres, faces, joints with names) and prints the distance
-between the surfaces, both ways: true vertices to the fitted surface, and fitted vertices to the true surface.
-Only the hand counts: what lies behind the wrist joint is left out.
+``python benchmarks/hand_truth.py CLIP_DIR... [--frames 12]`` fits one shape and a pose per frame to the
+ground-truth surfaces in CLIP_DIR/truth.npz (vertices [T,V,3] world metres, faces, joints with names) and
+prints the distance between the surfaces, both ways: true vertices to the fitted surface, and fitted vertices
+to the true surface. Only the hand counts: what lies behind the wrist joint is left out.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,7 +85,7 @@ class Fit:
         self._optimise(joint_steps, self._joint_loss, 0.03)
         self._optimise(surface_steps, self._surface_loss, 0.02)
 
-    def _optimise(self, steps: int, loss_of: object, rate: float) -> None:
+    def _optimise(self, steps: int, loss_of: Callable[[int], Tensor], rate: float) -> None:
         leaves = [self.betas, self.orient, self.fingers, self.shift]
         for leaf in leaves:
             leaf.requires_grad_(True)
@@ -100,14 +100,14 @@ class Fit:
             for group, start in zip(optimizer.param_groups, first, strict=True):
                 group["lr"] = start * (1 - step / steps) ** 0.7
             optimizer.zero_grad()
-            loss: Tensor = loss_of(step)  # type: ignore[operator]
+            loss = loss_of(step)
             excess = limit_excess(self.fingers, self.limits, self.frames).square().sum((-1, -2)).mean()
             (loss + 2e-5 * excess + 2e-8 * self.betas.square().sum()).backward()  # type: ignore[no-untyped-call]
             optimizer.step()
         for leaf in leaves:
             leaf.requires_grad_(False)
 
-    def _joint_loss(self, step: int) -> Tensor:
+    def _joint_loss(self, _step: int) -> Tensor:
         # Joint definitions differ (their wrist lies farther back), so the wrist hardly counts.
         weight = torch.ones(21)
         weight[0] = 0.05
@@ -118,7 +118,7 @@ class Fit:
         refined = self.fine.apply(self.model(self.pose())[0])
         if step % 8 == 0:
             self._match(refined.detach())
-        a = (refined[self.frame_of, self.ours] - self.truth.vertices[self.frame_of, self.theirs])
+        a = refined[self.frame_of, self.ours] - self.truth.vertices[self.frame_of, self.theirs]
         normal = self.true_normals[self.frame_of, self.theirs]
         plane = (a * normal).sum(-1).square()
         return (plane + 0.1 * a.square().sum(-1)).mean()

@@ -87,7 +87,7 @@ class Avatar:
             kept = AttachedSurfels(
                 every.means[:, self.kept], every.tangents[:, self.kept], every.normals[:, self.kept]
             )
-            return PosedSurfels(kept, posed.bone_rotations, posed.joints)
+            return PosedSurfels(kept, posed.outline_vertices, posed.bone_rotations, posed.joints)
 
     def render_pose(
         self, pose: HandPose, camera: Camera, options: RasterOptions | None = None
@@ -100,7 +100,7 @@ class Avatar:
                 0,
                 self.binding.bones[self.kept],
                 camera,
-                options or RasterOptions(),
+                options or RasterOptions(cull_backfaces=True),
             )
 
     def resolve_pose(self, spec: str) -> HandPose:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from mass_engine.errors import EngineError
 from mass_engine.fitting.views import View
 from mass_engine.hand.builtin import load_builtin
 from mass_engine.hand.model import HandModel
-from mass_engine.hand.pose import HandPose
+from mass_engine.hand.pose import HandPose, Side
 from mass_engine.options import FitOptions
 from mass_engine.progress import ProgressMeter
 from mass_engine.tracking.alignment import align_landmarks, interpolate_pose
@@ -94,8 +95,9 @@ def _landmarks(
             yield frame
 
     if imported is None:
-        track = track_main_hand(frames(), HandNetworks.load(), options.is_heldout, side=options.side)
-        return [mark for mark in track.landmarks if mark.trusted], times
+        track = track_main_hand(frames(), HandNetworks.load(), options.is_heldout)
+        side = track.side if options.side == "auto" else cast("Side", options.side)
+        return [replace(mark, side=side) for mark in track.hands.values() if mark.trusted], times
     for _ in frames():
         pass
     world = imported.joints3d - imported.joints3d.mean(1, keepdims=True)

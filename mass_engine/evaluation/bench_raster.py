@@ -1,8 +1,8 @@
 """`mass-engine bench raster`: how fast the rasteriser is, next to its yardsticks, measured in one run.
 
-The scene is a hand-shaped closed surface (a palm and five fingers, rounded cones) covered by two layers of surfels
-that overlap as an avatar's do, seen so that it fills about a third of the image. Times are medians of interleaved
-repetitions with their quartiles.
+The scene is a hand-shaped closed surface (a palm and five fingers, rounded cones) covered by two layers of
+surfels that overlap as an avatar's do, seen so that it fills about a third of the image. Times are medians of
+interleaved repetitions with their quartiles.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Scene:
 
 
 def _spread(area: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """``count`` points over limbs by ``area``: limb index, position along it and around it in 0..1, each [count]."""
+    """``count`` points over limbs by ``area``: limb, position along it and around it (0..1), each [count]."""
     edges = (area.cumsum(0) / area.sum() * count).round().long()
     sizes = torch.diff(edges, prepend=torch.zeros(1, dtype=torch.long))
     limb = torch.repeat_interleave(torch.arange(len(area)), sizes)
@@ -66,7 +66,7 @@ def _spread(area: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def hand_scene(count: int, seed: int = 0) -> Scene:
-    """``count`` surfels in two layers on the closed surface, normals outwards (third axis), scales from the spacing."""
+    """``count`` surfels in two layers on the closed surface: normals outwards, scales from the spacing."""
     generator = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> Tensor:
@@ -76,7 +76,7 @@ def hand_scene(count: int, seed: int = 0) -> Scene:
     radii = torch.tensor([[limb[2], limb[3]] for limb in _LIMBS])
     lengths = (ends - starts).norm(dim=-1)
     area = 2 * math.pi * radii.mean(-1) * (lengths + 2 * radii.mean(-1))
-    # Each layer is spread evenly (a golden-ratio lattice over each limb), in index order along the limb as on a mesh.
+    # Each layer is spread evenly (a golden-ratio lattice over each limb), in order along the limb.
     layers = [_spread(area, count // 2), _spread(area, count - count // 2)]
     limb, u, v = (torch.cat(parts) for parts in zip(*layers, strict=True))
     axis = ((ends - starts) / lengths[:, None])[limb]
@@ -122,7 +122,9 @@ def hand_camera(width: int, height: int) -> Camera:
 Step = Callable[[], RenderOutput]
 
 
-def forward_step(scene: Scene, camera: Camera, options: RasterOptions, renderer: Renderer | None = None) -> Step:
+def forward_step(
+    scene: Scene, camera: Camera, options: RasterOptions, renderer: Renderer | None = None
+) -> Step:
     """One forward pass as a function; ``renderer`` None takes the public way in."""
 
     def step() -> RenderOutput:
@@ -134,18 +136,21 @@ def forward_step(scene: Scene, camera: Camera, options: RasterOptions, renderer:
     return step
 
 
-def training_step(scene: Scene, camera: Camera, options: RasterOptions, renderer: Renderer | None = None) -> Step:
-    """Forward and backward with a gradient into every output and out of every surfel input and the camera pose."""
+def training_step(
+    scene: Scene, camera: Camera, options: RasterOptions, renderer: Renderer | None = None
+) -> Step:
+    """Forward and backward: a gradient into every output, and out of every surfel input and the pose."""
     leaves = [t.clone().requires_grad_() for t in scene.tensors()]
+    learned = Scene(*leaves)
     pose = camera.world_to_camera.clone().requires_grad_()
     camera = Camera(camera.K, pose, camera.width, camera.height)
     gradients: list[Tensor] = []
 
     def step() -> RenderOutput:
         if renderer is None:
-            out = rasterize(*leaves, camera, options=options)
+            out = rasterize(*learned.tensors(), camera, options=options)
         else:
-            out = cpu_backend.rasterize(*leaves, camera, options, renderer)  # type: ignore[arg-type]
+            out = cpu_backend.rasterize(*learned.tensors(), camera, options, renderer)
         images = [out.rgb, out.alpha, out.depth]
         if out.extras is not None:
             images += [out.median_depth, out.normal, out.distortion]
@@ -192,7 +197,10 @@ def _summary(times: list[float]) -> Timing:
 
 
 def _variants(scene: Scene, camera: Camera, args: argparse.Namespace) -> dict[str, Step]:
-    color, everything = RasterOptions(threads=args.threads), RasterOptions(outputs="all", threads=args.threads)
+    color, everything = (
+        RasterOptions(threads=args.threads),
+        RasterOptions(outputs="all", threads=args.threads),
+    )
     culled = RasterOptions(cull_backfaces=True, threads=args.threads)
     steps = {
         "forward": forward_step(scene, camera, color),

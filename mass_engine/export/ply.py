@@ -61,7 +61,9 @@ def write_ply(cloud: SurfelCloud, path: Path, flavour: Flavour = "2dgs") -> None
             file.write(np.ascontiguousarray(table).tobytes())
         os.replace(partial, path)
     except OSError as error:
-        raise EngineError("export.out", f"{path} cannot be written ({error.strerror}).", "Check the path.") from error
+        raise EngineError(
+            "export.out", f"{path} cannot be written ({error.strerror}).", "Check the path."
+        ) from error
 
 
 def read_ply(path: Path) -> SurfelCloud:
@@ -74,7 +76,9 @@ def read_ply(path: Path) -> SurfelCloud:
     names = [line.split()[-1].decode() for line in head.splitlines() if line.startswith(b"property float ")]
     flavour: Flavour = "3dgs" if "scale_2" in names else "2dgs"
     if not mark or names != _names(flavour) or len(body) % (4 * len(names)):
-        raise EngineError("ply.invalid", f"{path.name} is not a surfel PLY.", "Give a file written by export.")
+        raise EngineError(
+            "ply.invalid", f"{path.name} is not a surfel PLY.", "Give a file written by export."
+        )
     table: NDArray[np.float32] = np.frombuffer(body, "<f4").reshape(-1, len(names)).astype(np.float32)
     column = {name: place for place, name in enumerate(names)}
     values = torch.from_numpy(table)

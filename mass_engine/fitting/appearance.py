@@ -96,9 +96,10 @@ class AppearanceFit:
             level, surfels = self.views[row].level(side), self.surfels(row)
             colors = torch.zeros(size, 3, requires_grad=True)
             out = draw(surfels.row(0), opacities, colors, level.camera, self.raster)
-            cover = level.hand.unsqueeze(-1)
-            (seen,) = torch.autograd.grad(out.rgb, colors, level.rgb * cover, retain_graph=True)
-            kinds = torch.stack([level.hand, 1 - level.valid, (1 - level.hand) * level.valid], -1)
+            cover, usable = level.hand.unsqueeze(-1), level.colored.unsqueeze(-1)
+            (seen,) = torch.autograd.grad(out.rgb, colors, level.rgb * cover * usable, retain_graph=True)
+            forearm = 1 - level.valid
+            kinds = torch.stack([level.hand * level.colored, forearm, (1 - level.hand) * level.valid], -1)
             (weights,) = torch.autograd.grad(out.rgb, colors, kinds)
             shading = (irradiance_basis(surfels.attached.normals[0]) @ light).clamp_min(0.05)
             hand, ignored, background = hand + weights[:, 0], ignored + weights[:, 1], background + weights[:, 2]
@@ -152,9 +153,9 @@ class AppearanceFit:
         area = level.hand.sum().clamp_min(16.0)
         cover = level.hand.unsqueeze(-1)
         target = level.rgb * cover + background * (1 - cover)
-        loss = losses.photometric(out.rgb, target, level.valid, area)
+        loss = losses.photometric(out.rgb, target, level.colored, area)
         if stage.dssim > 0:
-            inside = level.valid * (level.hand > 0)
+            inside = level.colored * (level.hand > 0)
             loss = (1 - stage.dssim) * loss + stage.dssim * 2 * losses.dssim(out.rgb, target, inside)
         return loss + 0.5 * losses.silhouette(out.alpha, level.hand, level.valid, area)
 

@@ -29,12 +29,13 @@ class GeometryWeights:
 
     color: float = 1.0
     silhouette: float = 1.0
+    outline: float = 2.0  # per hand size
     landmarks: float = 0.5
-    limits: float = 5.0
+    limits: float = 0.5
     smooth: float = 2.0
     shape: float = 1e-3
-    laplacian: float = 2e4  # per metre^2 across an edge
-    thickness: float = 2e3  # per metre^2 of displacement
+    laplacian: float = 4e3  # per metre^2 across an edge
+    thickness: float = 2e2  # per metre^2 of displacement
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class GeometryPass:
 
     side: int
     visits: float
+    levels: int = 0
+    depth: int = 1
     rate: float = 1.0
     batch: int = 4
     color: bool = True
@@ -55,21 +58,19 @@ SHARED_RATES = {"betas": 0.02, "displacement": 1.5e-4, "albedo": 0.02, "light": 
 
 
 class GeometryFit:
-    """Stage one over ``views`` (rows of ``table``), with surfels of ``binding``."""
+    """Stage one over ``views`` (rows of ``table``)."""
 
     def __init__(
         self,
         views: list[View],
         table: PoseTable,
         shape: Shape,
-        appearance: Appearance,
-        binding: MeshBinding,
         camera: Camera,
         seed: int,
         raster: RasterOptions,
     ) -> None:
-        self.views, self.table, self.shape, self.appearance = views, table, shape, appearance
-        self.binding, self.camera, self.raster = binding, camera, raster
+        self.views, self.table, self.shape = views, table, shape
+        self.camera, self.raster = camera, raster
         self.rejected_steps = 0
         self._random = torch.Generator().manual_seed(seed)
         self._edges = mesh_edges(shape.model.faces)
@@ -85,12 +86,17 @@ class GeometryFit:
             self._joints = shape.model.joints(table.pose(shape.betas))
 
     def run(
-        self, stage: GeometryPass, rows: Tensor | None = None, progress: Callable[[float], None] | None = None
+        self,
+        stage: GeometryPass,
+        binding: MeshBinding,
+        appearance: Appearance,
+        rows: Tensor | None = None,
+        progress: Callable[[float], None] | None = None,
     ) -> None:
-        """Run one pass over ``rows`` (the training rows unless given)."""
+        """Run one pass over ``rows`` (the training rows unless given) with the surfels of ``binding``."""
         rows = self._trained if rows is None else rows
         steps = max(1, round(stage.visits * len(rows) / stage.batch))
-        shared = self._shared_parameters() if stage.shared else {}
+        shared = self._shared_parameters(appearance) if stage.shared else {}
         optimizer = torch.optim.Adam(
             [{"params": [value], "lr": SHARED_RATES[name] * stage.rate} for name, value in shared.items()]
             or [{"params": [torch.zeros(1, requires_grad=True)]}],
@@ -108,7 +114,7 @@ class GeometryFit:
                 group["lr"] = SHARED_RATES[name] * stage.rate * decay
             leaves = self.table.leaves(chosen)
             optimizer.zero_grad(set_to_none=True)
-            loss = self._loss(stage, chosen, leaves)
+            loss = self._loss(stage, binding, appearance, chosen, leaves)
             loss.backward()  # type: ignore[no-untyped-call]
             if not self._finite(loss, leaves, shared):
                 self.rejected_steps += 1  # a step that would poison the state is not taken
@@ -121,12 +127,12 @@ class GeometryFit:
         for value in shared.values():
             value.requires_grad_(False)
 
-    def _shared_parameters(self) -> dict[str, Tensor]:
+    def _shared_parameters(self, appearance: Appearance) -> dict[str, Tensor]:
         parameters = {
             "betas": self.shape.betas,
             "displacement": self.shape.displacement,
-            "albedo": self.appearance.albedo,
-            "light": self.appearance.light,
+            "albedo": appearance.albedo,
+            "light": appearance.light,
         }
         return {name: value.requires_grad_(True) for name, value in parameters.items()}
 
@@ -135,28 +141,41 @@ class GeometryFit:
         grads = [value.grad for value in (*leaves.values(), *shared.values()) if value.grad is not None]
         return bool(torch.isfinite(loss)) and all(bool(torch.isfinite(grad).all()) for grad in grads)
 
-    def _loss(self, stage: GeometryPass, rows: Tensor, leaves: dict[str, Tensor]) -> Tensor:
+    def _loss(
+        self,
+        stage: GeometryPass,
+        binding: MeshBinding,
+        appearance: Appearance,
+        rows: Tensor,
+        leaves: dict[str, Tensor],
+    ) -> Tensor:
         w = stage.weights
-        surfels = pose_surfels(self.shape, self.binding, self.table.pose(self.shape.betas, leaves))
+        surfels = pose_surfels(self.shape, binding, self.table.pose(self.shape.betas, leaves))
+        camera = self.camera.world_to_camera
+        in_camera = surfels.outline_vertices @ camera[:3, :3].T + camera[:3, 3]
         total = torch.zeros(())
         for place, row in enumerate(rows.tolist()):
             level = self.views[row].level(stage.side)
             background = torch.rand(3, generator=self._random)
             out = render_row(
-                self.appearance,
+                appearance,
                 surfels,
                 place,
-                self.binding.bones,
+                binding.bones,
                 level.camera,
                 self.raster,
                 background if stage.color else None,
             )
             area = level.hand.sum().clamp_min(16.0)
+            K, outline = self.views[row].camera.K, self.views[row].outline()
+            flat = in_camera[place, :, :2] / in_camera[place, :, 2:].clamp_min(1e-3) @ K[:2, :2].T + K[:2, 2]
+            apart = losses.outline_distance(flat, outline.points, outline.outside)
+            total = total + w.outline * apart / (self._sizes[row] * K[0, 0] / self.camera.K[0, 0])
             total = total + w.silhouette * losses.silhouette(out.alpha, level.hand, level.valid, area)
             if stage.color:
                 cover = level.hand.unsqueeze(-1)
                 target = level.rgb * cover + background * (1 - cover)
-                total = total + w.color * losses.photometric(out.rgb, target, level.valid, area)
+                total = total + w.color * losses.photometric(out.rgb, target, level.colored, area)
         total = total + self._pose_terms(w, rows, leaves, surfels.joints) * len(rows)
         total = total / len(rows)
         if stage.shared:

@@ -24,6 +24,24 @@ def silhouette(alpha: Tensor, hand: Tensor, valid: Tensor, area: Tensor) -> Tens
     return (charbonnier(alpha - hand, 0.05) * valid).sum() / area
 
 
+def outline_distance(vertices: Tensor, points: Tensor, outside: Tensor) -> Tensor:
+    """How far a projected mesh is from an outline, in pixels (scalar), from any distance.
+
+    ``vertices`` [V,2] pixels; ``points`` [C,2] on the outline, each drawn to its nearest vertex; ``outside``
+    [1,1,h,w] distance map: vertices out there are drawn back in. What surfels cannot do, whose pull ends a
+    few pixels from them.
+    """
+    height, width = outside.shape[-2:]
+    total = vertices.sum() * 0.0
+    if len(points) > 0:
+        with torch.no_grad():
+            nearest = torch.cdist(points, vertices).argmin(1)
+        total = total + charbonnier((vertices[nearest] - points).square().sum(-1).add(1e-6).sqrt(), 2.0).mean()
+    grid = vertices / torch.tensor([width / 2, height / 2]) - 1
+    depth = functional.grid_sample(outside, grid[None, None], padding_mode="border", align_corners=False)
+    return total + charbonnier(depth, 2.0).mean() * 4
+
+
 def dssim(rgb: Tensor, target: Tensor, valid: Tensor) -> Tensor:
     """(1 - SSIM) / 2 with a 7x7 box window (zero outside), averaged over the valid pixels.
 

@@ -66,9 +66,10 @@ class Appearance:
 @dataclass
 class PosedSurfels:
     """Surfels of a batch of poses (means [B,N,3], tangents [B,N,2,3], normals [B,N,3]), with
-    ``bone_rotations`` [B,16,3,3] and ``joints`` [B,21,3]."""
+    ``bone_rotations`` [B,16,3,3], ``joints`` [B,21,3] and the refined mesh's ``outline_vertices`` [B,V',3]."""
 
     attached: AttachedSurfels
+    outline_vertices: Tensor
     bone_rotations: Tensor
     joints: Tensor
 
@@ -81,7 +82,8 @@ class PosedSurfels:
 def pose_surfels(shape: Shape, binding: MeshBinding, pose: HandPose) -> PosedSurfels:
     """Pose the hand and register a surfel in every small triangle; ``pose`` is batched [B]."""
     posed = shape.model.posed(pose, shape.offsets())
-    return PosedSurfels(binding.surfels(posed.vertices), posed.bone_transforms[..., :3, :3], posed.joints)
+    refined = binding.subdivision.apply(posed.vertices)
+    return PosedSurfels(binding.register(refined), refined, posed.bone_transforms[..., :3, :3], posed.joints)
 
 
 def surfel_colors(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -23,16 +23,18 @@ from mass_engine.surfel.shading import white_light
 from mass_engine.tracking.alignment import interpolate_pose
 
 
+#: How far from the stump's end the hand may be cut, metres at the mean size: up to the wrist's crease and a little on.
+WRIST_REACH = 0.06
+
+
 @dataclass(frozen=True)
 class Schedule:
-    """How much work a preset does: stage-one passes on a coarse binding, stage-two passes on the final one.
+    """How much work a preset does.
 
-    ``levels`` and ``depth`` are Loop levels and fractal depth; ``harmonics`` the number of view-dependent
-    coefficients a colour channel has (0, 3, 8, 15).
+    ``levels`` and ``depth`` are the Loop levels and fractal depth of the final surfels; ``harmonics`` is the
+    number of view-dependent coefficients a colour channel has (0, 3, 8, 15).
     """
 
-    coarse_levels: int
-    coarse_depth: int
     levels: int
     depth: int
     harmonics: int
@@ -45,28 +47,29 @@ class Schedule:
 
 def schedule_for(preset: str) -> Schedule:
     """The schedule of a preset (draft, auto, full)."""
-    rough = GeometryWeights(landmarks=2.0)
+    rough = GeometryWeights(landmarks=1.0, outline=20.0, limits=1.0)
+    middle = GeometryWeights(landmarks=0.1, outline=20.0)
+    fine = GeometryWeights(landmarks=0.05, outline=5.0)
+    first = GeometryPass(96, 10, rate=2.0, color=False, weights=rough)
     heldout = (
-        GeometryPass(96, 12, rate=0.7, color=False, shared=False, weights=rough),
-        GeometryPass(192, 8, rate=0.4, color=False, shared=False),
+        replace(first, visits=8, levels=1, depth=0, rate=1.0, shared=False, weights=middle),
+        GeometryPass(256, 8, levels=1, rate=0.4, color=False, shared=False, weights=fine),
     )
     if preset == "draft":
-        return Schedule(
-            0, 0, 1, 0, 0,
-            (GeometryPass(80, 8, color=False, weights=rough), GeometryPass(128, 6, rate=0.7)),
-            (AppearancePass(256, 2),),
-            heldout[:1], 40, 256,
-        )  # fmt: skip
+        geometry = (
+            replace(first, visits=8),
+            GeometryPass(160, 8, levels=1, depth=0, rate=1.5, weights=middle),
+        )
+        return Schedule(1, 0, 0, geometry, (AppearancePass(256, 2),), heldout, 40, 256)
     geometry = (
-        GeometryPass(96, 12, color=False, weights=rough),
-        GeometryPass(96, 8, rate=0.8),
-        GeometryPass(192, 10, rate=0.6),
-        GeometryPass(320, 6, rate=0.3),
+        first,
+        GeometryPass(160, 10, levels=1, depth=0, rate=1.5, weights=middle),
+        GeometryPass(320, 10, levels=1, depth=1, rate=0.6, weights=fine),
     )
     appearance = (AppearancePass(320, 2), AppearancePass(640, 3, rate=0.7, view_dependent=True))
     if preset == "auto":
-        return Schedule(0, 1, 1, 1, 3, geometry, appearance, heldout, 60, 640)
-    return Schedule(1, 1, 2, 1, 8, geometry, appearance, heldout, 100, 640)
+        return Schedule(1, 1, 3, geometry, appearance, heldout, 60, 640)
+    return Schedule(2, 1, 8, geometry, appearance, heldout, 100, 640)
 
 
 @dataclass(frozen=True)
@@ -99,13 +102,6 @@ def fit_hand(
     raster = RasterOptions(cull_backfaces=True)
     table = PoseTable(start)
     shape = Shape.mean(model, start.betas[0])
-    coarse = MeshBinding.build(model, schedule.coarse_levels, schedule.coarse_depth)
-    rough_look = Appearance(
-        torch.full((coarse.count, 3), 0.5),
-        torch.full((coarse.count,), _logit(START_OPACITY)),
-        torch.zeros(coarse.count, 0, 3),
-        white_light(),
-    )
     shares = _shares(schedule, views)
     done = 0.0
 
@@ -113,27 +109,30 @@ def fit_hand(
         begin = done
         return lambda fraction: progress(begin + share * fraction, note)
 
-    geometry = GeometryFit(views, table, shape, rough_look, coarse, camera, seed, raster)
-    colored = False
+    geometry = GeometryFit(views, table, shape, camera, seed, raster)
+    bindings: dict[tuple[int, int], MeshBinding] = {}
+
+    def bind(levels: int, depth: int) -> MeshBinding:
+        if (levels, depth) not in bindings:
+            bindings[levels, depth] = MeshBinding.build(model, levels, depth)
+        return bindings[levels, depth]
+
+    light = white_light()
     for stage, share in zip(schedule.geometry, shares.geometry, strict=True):
-        if stage.color and not colored:
-            evidence = AppearanceFit(views, table, shape, coarse, seed, raster).gather(
-                rough_look.light, stage.side, 40
-            )
-            rough_look.albedo = fill_unseen(evidence, coarse, 0.5)
-            colored = True
-        geometry.run(stage, progress=part(share, f"stage 1 at {stage.side} px"))
+        coarse = bind(stage.levels, stage.depth)
+        look = _plain(coarse, light)
+        if stage.color:
+            gatherer = AppearanceFit(views, table, shape, coarse, seed, raster)
+            look.albedo = fill_unseen(gatherer.gather(light, stage.side, 40), coarse, 0.5)
+        geometry.run(stage, coarse, look, progress=part(share, f"stage 1 at {stage.side} px"))
+        light = look.light
         done += share
 
-    binding = MeshBinding.build(model, schedule.levels, schedule.depth)
+    binding = bind(schedule.levels, schedule.depth)
     second = AppearanceFit(views, table, shape, binding, seed, raster)
-    evidence = second.gather(rough_look.light, schedule.gather_side, schedule.gather_frames)
-    appearance = Appearance(
-        fill_unseen(evidence, binding, 0.5),
-        torch.full((binding.count,), _logit(START_OPACITY)),
-        torch.zeros(binding.count, schedule.harmonics, 3),
-        rough_look.light.clone(),
-    )
+    evidence = second.gather(light, schedule.gather_side, schedule.gather_frames)
+    appearance = _plain(binding, light, schedule.harmonics)
+    appearance.albedo = fill_unseen(evidence, binding, 0.5)
     for step, share in zip(schedule.appearance, shares.appearance, strict=True):
         second.run(appearance, step, progress=part(share, f"stage 2 at {step.side} px"))
         done += share
@@ -142,9 +141,10 @@ def fit_hand(
     heldout = torch.tensor([row for row, view in enumerate(views) if view.heldout], dtype=torch.long)
     if len(heldout) > 0:
         for stage in schedule.heldout:
-            geometry.run(stage, heldout)
+            outline = bind(stage.levels, stage.depth)
+            geometry.run(stage, outline, _plain(outline, light), heldout)
 
-    kept = _keep(evidence)
+    kept = _keep(evidence, binding, model)
     avatar = Avatar(
         shape,
         binding,
@@ -184,18 +184,38 @@ def _shares(schedule: Schedule, views: list[View]) -> _Shares:
     return _Shares([value / total for value in first], [value / total for value in second])
 
 
+def _plain(binding: MeshBinding, light: Tensor, harmonics: int = 0) -> Appearance:
+    """Grey, opaque surfels under ``light``."""
+    return Appearance(
+        torch.full((binding.count, 3), 0.5),
+        torch.full((binding.count,), _logit(START_OPACITY)),
+        torch.zeros(binding.count, harmonics, 3),
+        light.clone(),
+    )
+
+
 def _logit(probability: float) -> float:
     return float(torch.logit(torch.tensor(probability)))
 
 
-def _keep(evidence: Evidence) -> Tensor:
-    """Surfels to keep: the avatar ends where the hand was seen to end.
+def _keep(evidence: Evidence, binding: MeshBinding, model: HandModel) -> Tensor:
+    """Surfels to keep: the hand ends where the clip shows it to end (a sleeve, a watch, the frame).
 
-    What the clip shows mostly as ignored (forearm) or background is cut; what it never shows stays, so
-    that the hand is whole from every side.
+    Along the forearm's axis the cut is put where it agrees best with what was seen as hand on one side and
+    as forearm or background on the other; everything beyond it goes, seen or not.
     """
-    seen = evidence.hand + evidence.ignored + evidence.background
-    return ((seen < 0.5) | (evidence.hand > 0.3 * seen)).nonzero()[:, 0]
+    with torch.no_grad():
+        along = binding.surfels(model.template).means[:, 0]  # the forearm runs along +x of the right hand
+    along = along if model.side == "right" else -along
+    wrist = along > along.max() - WRIST_REACH
+    order = along[wrist].argsort()
+    gain = (0.4 * (evidence.ignored + evidence.background) - evidence.hand)[wrist][order]
+    # Cutting before rank k gains what lies beyond it.
+    beyond = torch.cat([gain.flip(0).cumsum(0).flip(0), torch.zeros(1)])
+    rank = int(beyond.argmax())
+    sorted_along = along[wrist][order]
+    cut = float("inf") if rank == len(sorted_along) else float(sorted_along[rank])
+    return (along < cut).nonzero()[:, 0]
 
 
 def _place_heldout(views: list[View], table: PoseTable, start: HandPose) -> None:

@@ -11,17 +11,34 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mass_engine.camera import Camera
-from mass_engine.tracking.segmentation import HAND, IGNORE
+from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE
+
+
+#: Width in pixels of the seam along ignored regions in which colours are not trusted.
+SEAM = 7
+#: Most points an outline is described by.
+OUTLINE_POINTS = 192
 
 
 @dataclass(frozen=True)
 class Level:
-    """One resolution of a view: ``rgb`` [h,w,3] in 0..1, ``hand`` [h,w] coverage in 0..1, ``valid`` [h,w]."""
+    """One resolution of a view: ``rgb`` [h,w,3] in 0..1, ``hand`` [h,w] coverage in 0..1; ``valid`` [h,w] is 0
+    where the mask ignores, ``colored`` [h,w] also where colours may be mixed with what is ignored."""
 
     rgb: Tensor
     hand: Tensor
     valid: Tensor
+    colored: Tensor
     camera: Camera
+
+
+@dataclass(frozen=True)
+class Outline:
+    """``points`` [C,2]: where hand meets background, in pixels of the crop. ``outside`` [1,1,h,w]: distance in
+    pixels from each pixel to the nearest one that is hand or ignored."""
+
+    points: Tensor
+    outside: Tensor
 
 
 @dataclass
@@ -34,9 +51,10 @@ class View:
     rgb: NDArray[np.uint8]
     labels: NDArray[np.uint8]
     camera: Camera
-    points: NDArray[np.float32]  # [21,2] pixels of the crop
+    points: NDArray[np.float32]  # [21,2] pixels of the whole picture
     score: float
     _levels: dict[int, Level] = field(default_factory=dict, repr=False)
+    _outline: Outline | None = field(default=None, repr=False)
 
     def level(self, side: int) -> Level:
         """The view with its longer side reduced to at most ``side`` pixels (kept for the next call)."""
@@ -44,9 +62,11 @@ class View:
             self._levels[side] = self._reduce(side)
         return self._levels[side]
 
-    def forget_levels(self) -> None:
-        """Drop the kept reductions (they are a few times the crop's own memory)."""
-        self._levels.clear()
+    def outline(self) -> Outline:
+        """The hand's outline and the distances outside it (kept for the next call)."""
+        if self._outline is None:
+            self._outline = _trace(self.labels, self.camera)
+        return self._outline
 
     def _reduce(self, side: int) -> Level:
         height, width = self.labels.shape
@@ -54,23 +74,36 @@ class View:
         w, h = max(1, round(width * scale)), max(1, round(height * scale))
         hand = (self.labels == HAND).astype(np.float32)
         ignore = (self.labels == IGNORE).astype(np.float32)
+        # Colours next to a sleeve are mixed with it.
+        near = cv2.dilate(ignore, np.ones((SEAM, SEAM), np.uint8))
         rgb = self.rgb
         if scale < 1:
             rgb = cv2.resize(rgb, (w, h), interpolation=cv2.INTER_AREA)
-            hand, ignore = (cv2.resize(m, (w, h), interpolation=cv2.INTER_AREA) for m in (hand, ignore))
+            hand, ignore, near = (
+                cv2.resize(m, (w, h), interpolation=cv2.INTER_AREA) for m in (hand, ignore, near)
+            )
         return Level(
             torch.from_numpy(rgb.astype(np.float32) / 255),
             torch.from_numpy(hand),
             torch.from_numpy((ignore < 0.5).astype(np.float32)),
+            torch.from_numpy((near < 0.1).astype(np.float32)),
             self.camera.resized(w, h),
         )
 
 
-def crop_box(points: NDArray[np.float32], width: int, height: int, margin: float) -> tuple[int, int, int, int]:
-    """The box (x, y, w, h) around ``points`` [21,2], ``margin`` hand sizes wider on each side, in the image."""
-    low, high = points.min(0), points.max(0)
-    reach = margin * float((high - low).max())
-    x0, y0 = (int(max(0, np.floor(v - reach))) for v in low)
-    x1 = int(min(width, np.ceil(high[0] + reach)))
-    y1 = int(min(height, np.ceil(high[1] + reach)))
-    return x0, y0, max(1, x1 - x0), max(1, y1 - y0)
+def _trace(labels: NDArray[np.uint8], camera: Camera) -> Outline:
+    """The outline of the hand label, without what borders on ignored pixels or on the crop's edge."""
+    height, width = labels.shape
+    hand = (labels == HAND).astype(np.uint8)
+    free = np.zeros((height, width), bool)
+    free[2:-2, 2:-2] = True
+    free &= cv2.dilate((labels == IGNORE).astype(np.uint8), np.ones((SEAM, SEAM), np.uint8)) == 0
+    contours, _ = cv2.findContours(hand, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    pixels = np.concatenate([c.reshape(-1, 2) for c in contours if len(c) >= 12] or [np.zeros((0, 2), np.int32)])
+    pixels = pixels[free[pixels[:, 1], pixels[:, 0]]] if len(pixels) else pixels
+    if len(pixels) > OUTLINE_POINTS:
+        pixels = pixels[np.linspace(0, len(pixels) - 1, OUTLINE_POINTS).round().astype(int)]
+    outside = cv2.distanceTransform((labels == BACKGROUND).astype(np.uint8), cv2.DIST_L2, 3)
+    return Outline(
+        torch.from_numpy(pixels.astype(np.float32) + 0.5), torch.from_numpy(outside.astype(np.float32))[None, None]
+    )

@@ -1,9 +1,10 @@
 """The built-in hand's anatomy: bones, soft tissue and what each shape parameter changes.
 
 Right hand at rest: fingers along -x, palm towards -y, thumb towards +z, wrist joint at the origin; metres.
-Segment lengths are the means of Buryanov and Kotiuk (2010, "Proportions of hand segments"); radii follow the
-finger breadths of adult hands in the same range. One unit of a shape parameter is about one standard deviation
-of adults (Greiner 1991, hand anthropometry of U.S. Army personnel); :data:`SHAPE_RANGES` reaches children.
+Segment lengths are the means of Buryanov and Kotiuk (2010, "Proportions of hand segments"); breadths and
+depths lie within the adult ranges of Garrett (1971, "The adult human hand") and Greiner (1991, hand
+anthropometry of U.S. Army personnel). One unit of a shape parameter is about one standard deviation of
+adults; :data:`SHAPE_RANGES` reaches children.
 """
 
 from __future__ import annotations
@@ -31,59 +32,91 @@ SHAPE_NAMES: tuple[str, ...] = (
 #: Change of the quantity per unit of each parameter, as a fraction.
 SHAPE_STEPS: tuple[float, ...] = (0.06, 0.05, 0.05, 0.05, 0.05, 0.06, 0.08, 0.07, 0.04, 0.05)
 
-#: Least and greatest sensible value of each parameter: from a child of about six (size -5) to very large hands.
+#: Least and greatest sensible value of each parameter: a child of about six has size -5.
 SHAPE_RANGES: tuple[tuple[float, float], ...] = ((-6.0, 4.0), *(((-4.0, 4.0),) * 9))
 
 FINGERS = ("index", "middle", "pinky", "ring")
+DIGITS = (*FINGERS, "thumb")
 FIRST_JOINT = {"index": 1, "middle": 4, "pinky": 7, "ring": 10, "thumb": 13}
 TIP_POINT = {"thumb": 16, "index": 17, "middle": 18, "ring": 19, "pinky": 20}
 
 #: Knuckle (first finger joint) positions, and how far each finger is turned outward at rest (radians).
 _KNUCKLES = {
-    "index": (-0.0900, 0.0030, 0.0240),
-    "middle": (-0.0935, 0.0060, 0.0020),
-    "ring": (-0.0880, 0.0040, -0.0180),
-    "pinky": (-0.0790, -0.0010, -0.0350),
+    "index": (-0.0905, 0.0005, 0.0235),
+    "middle": (-0.0940, 0.0030, 0.0010),
+    "ring": (-0.0875, 0.0010, -0.0200),
+    "pinky": (-0.0775, -0.0045, -0.0375),
 }
 _SPLAY = {"index": 0.09, "middle": 0.0, "ring": -0.09, "pinky": -0.20}
-#: Proximal, middle, distal segment with soft tip (mm), and radii from knuckle to tip (mm).
+#: Proximal, middle, distal segment with soft tip (mm; the tips a little longer than the source's).
 _SEGMENTS = {
-    "index": (39.8, 22.4, 15.8 + 3.8),
-    "middle": (44.6, 26.3, 17.4 + 4.0),
-    "ring": (41.4, 25.7, 17.3 + 4.0),
-    "pinky": (32.7, 18.1, 16.0 + 3.7),
+    "index": (39.8, 22.4, 15.8 + 5.2),
+    "middle": (44.6, 26.3, 17.4 + 5.4),
+    "ring": (41.4, 25.7, 17.3 + 5.4),
+    "pinky": (32.7, 18.1, 16.0 + 4.8),
 }
-_RADII = {
-    "index": (10.2, 9.0, 7.9, 6.4),
-    "middle": (10.4, 9.2, 8.1, 6.6),
-    "ring": (9.8, 8.6, 7.6, 6.2),
-    "pinky": (8.8, 7.6, 6.7, 5.5),
-}
-_THUMB_BASE = (-0.0200, -0.0130, 0.0250)
+_THUMB_BASE = (-0.0200, -0.0110, 0.0225)
 _THUMB_DIRECTIONS = ((-0.72, -0.28, 0.63), (-0.84, -0.24, 0.48), (-0.86, -0.22, 0.46))
-_THUMB_SEGMENTS = (46.2, 31.6, 21.7 + 5.7)
-_THUMB_RADII = (15.0, 11.8, 10.4, 7.4)
-#: Where the forearm stump is cut off, and how far the wrist's soft tissue reaches.
-STUMP = 0.022
+_THUMB_SEGMENTS = (46.2, 31.6, 21.7 + 7.0)
+#: The thumb's back looks this way, turned by about 50 degrees against the fingers' (which look along +y).
+THUMB_BACK = (0.0, 0.6, 0.8)
+
+#: Cross-sections along a finger: place (joint number + fraction of the segment), half breadth, height above
+#: the bone (back) and below it (pad), in mm of the index finger. The round tip begins at the last.
+_FINGER_SECTIONS = (
+    (0.00, 6.8, 5.2, 8.0),
+    (0.25, 8.2, 6.6, 10.2),
+    (0.60, 9.3, 8.0, 10.4),
+    (1.00, 9.5, 8.3, 8.7),
+    (1.50, 8.8, 7.3, 9.3),
+    (2.00, 8.3, 6.9, 7.3),
+    (2.45, 8.1, 5.9, 8.3),
+    (2.72, 7.6, 5.3, 7.6),
+)
+_FINGER_FACTOR = {"index": 1.0, "middle": 1.03, "ring": 0.96, "pinky": 0.85}
+_FINGER_TIP = 5.8
+_THUMB_SECTIONS = (
+    (0.00, 12.0, 10.0, 12.0),
+    (0.50, 10.4, 9.0, 10.4),
+    (1.00, 9.2, 8.6, 8.4),
+    (1.50, 9.9, 8.6, 10.0),
+    (2.00, 10.8, 8.8, 9.0),
+    (2.45, 10.8, 6.8, 9.8),
+    (2.72, 9.8, 6.0, 8.8),
+)
+_THUMB_TIP = 7.4
+#: The same for the bones of the palm, from the carpus to the knuckle.
+_PALM_SECTIONS = (
+    (0.0, 10.5, 11.0, 13.5),
+    (0.3, 10.5, 12.2, 15.0),
+    (0.6, 10.5, 11.4, 15.6),
+    (0.82, 9.4, 8.8, 14.2),
+    (1.0, 6.5, 6.0, 9.0),
+)
+_CARPUS = {"index": 0.45, "middle": 0.35, "ring": 0.42, "pinky": 0.48}
+#: Where the forearm stump is cut off.
+STUMP = 0.030
 
 
 @dataclass(frozen=True)
-class RoundCone:
-    """Soft tissue around the segment from ``start`` to ``end``: a sphere rolled along it while its radius goes
-    from ``start_radius`` to ``end_radius``. ``group`` says with what it blends, ``joint`` what moves it."""
+class Tissue:
+    """Soft tissue around a line of points: at each, half breadth, height towards ``back`` and away from it.
+
+    ``line`` [P,3], ``sections`` [P,3] (breadth, back, pad), ``back`` [3] unit, ``tip`` the length of the
+    round ends, all metres. ``group`` names what it blends with, ``blend`` how widely.
+    """
 
     group: str
-    joint: int
-    start: Vector
-    end: Vector
-    start_radius: float
-    end_radius: float
+    line: Vector
+    sections: Vector
+    back: Vector
+    tip: float
+    blend: float
 
 
 def _factors(betas: Vector) -> dict[str, float]:
-    return {
-        name: 1.0 + step * float(value) for name, step, value in zip(SHAPE_NAMES, SHAPE_STEPS, betas, strict=True)
-    }
+    steps = zip(SHAPE_NAMES, SHAPE_STEPS, betas, strict=True)
+    return {name: 1.0 + step * float(value) for name, step, value in steps}
 
 
 def skeleton(betas: Vector) -> Vector:
@@ -107,40 +140,92 @@ def skeleton(betas: Vector) -> Vector:
     return points * f["size"]
 
 
-def soft_tissue(betas: Vector) -> list[RoundCone]:
-    """The round cones whose blended union is the hand with shape ``betas`` [10]."""
+def digit_line(points: Vector, digit: str) -> Vector:
+    """First joint to tip [4,3] of one digit, from the 21 points."""
+    first = FIRST_JOINT[digit]
+    return points[[first, first + 1, first + 2, TIP_POINT[digit]]]
+
+
+def soft_tissue(betas: Vector) -> list[Tissue]:
+    """The tissue whose blended union is the hand with shape ``betas`` [10]."""
     f, points = _factors(betas), skeleton(betas)
     size = f["size"]
-    finger, palm, wrist = (f[name] * size for name in ("finger_thickness", "palm_thickness", "wrist_thickness"))
-    wide, far = f["palm_width"], f["palm_length"]
-    cones = []
+    finger, palm, wrist = (
+        size * f[name] for name in ("finger_thickness", "palm_thickness", "wrist_thickness")
+    )
+    wide = f["palm_width"] * size
+    up = np.array([0.0, 1.0, 0.0])
 
     def at(x: float, y: float, z: float) -> Vector:
-        return np.array([x * far, y, z * wide]) * size
+        """A point of the palm, millimetres of the mean hand."""
+        return np.array([x * f["palm_length"], y * f["palm_thickness"], z * f["palm_width"]]) * size * 1e-3
 
+    def lump(group: str, ends: tuple[Vector, Vector], radii: tuple[float, float], blend: float) -> Tissue:
+        sections = np.repeat(np.array(radii)[:, None], 3, 1) * palm * 1e-3
+        return Tissue(group, np.stack(ends), sections, up, float(sections[1, 0]), blend * size)
+
+    parts = []
     for name in FINGERS:
-        first, tip = FIRST_JOINT[name], TIP_POINT[name]
-        chain = [points[first], points[first + 1], points[first + 2], points[tip]]
-        radii = [radius * 1e-3 * finger for radius in _RADII[name]]
-        # The tip point is the finger's end: the last sphere stops there.
-        inward = (chain[2] - chain[3]) / np.linalg.norm(chain[2] - chain[3])
-        chain[3] = chain[3] + inward * radii[3]
-        for k in range(3):
-            cones.append(RoundCone(name, first + k, chain[k], chain[k + 1], radii[k], radii[k + 1]))
-        root = at(-0.012, -0.001, _KNUCKLES[name][2] * 0.55)
-        knuckle = points[first] + np.array([0.004, -0.003, 0.0]) * size
-        cones.append(RoundCone("palm", 0, root, knuckle, 0.0142 * palm, 0.0114 * palm))
-    radii = [radius * 1e-3 * finger for radius in _THUMB_RADII]
-    chain = [points[13], points[14], points[15], points[16]]
-    inward = (chain[2] - chain[3]) / np.linalg.norm(chain[2] - chain[3])
-    chain[3] = chain[3] + inward * radii[3]
-    for k in range(3):
-        cones.append(RoundCone("thumb", 13 + k, chain[k], chain[k + 1], radii[k], radii[k + 1]))
-    # The balls of thumb and little finger, and the two columns of the wrist.
-    cones.append(RoundCone("palm", 0, at(-0.020, -0.009, 0.013), at(-0.052, -0.012, 0.021), 0.0150 * palm, 0.0125 * palm))
-    cones.append(RoundCone("palm", 0, at(-0.020, -0.008, -0.017), at(-0.056, -0.010, -0.027), 0.0140 * palm, 0.0105 * palm))
-    for sign in (1.0, -1.0):
-        cones.append(
-            RoundCone("wrist", 0, at(0.035, 0.0, 0.0115 * sign), at(-0.010, 0.0, 0.0125 * sign), 0.0175 * wrist, 0.0155 * wrist)
+        parts.append(
+            _digit(
+                name, points, _FINGER_SECTIONS, _FINGER_FACTOR[name] * finger, up, _FINGER_TIP, 0.009 * size
+            )
         )
-    return cones
+        knuckle = points[FIRST_JOINT[name]]
+        root = np.array([-0.010 * f["palm_length"] * size, -0.002 * size, knuckle[2] * _CARPUS[name]])
+        places, breadths, backs, pads = np.array(_PALM_SECTIONS).T
+        heights = (
+            np.stack([breadths * wide, backs * palm, pads * palm], 1) * 1e-3 * _FINGER_FACTOR[name] ** 0.5
+        )
+        line = root + places[:, None] * (knuckle - root)
+        parts.append(Tissue("palm", line, heights, up, 0.009 * size, 0.010 * size))
+    back = np.array(THUMB_BACK)
+    parts.append(_digit("thumb", points, _THUMB_SECTIONS, finger, back, _THUMB_TIP, 0.016 * size))
+    # The skin between neighbouring fingers.
+    for a, b in (("index", "middle"), ("middle", "ring"), ("ring", "pinky")):
+        one, two = digit_line(points, a), digit_line(points, b)
+        ends = tuple(
+            0.62 * line[0] + 0.38 * line[1] + np.array([0.0, -0.0035, 0.0]) * size for line in (one, two)
+        )
+        parts.append(lump("web", (ends[0], ends[1]), (4.6, 4.6), 0.007))
+    # The balls of the thumb and of the little finger, and the skin between thumb and index.
+    thumb = digit_line(points, "thumb")
+    parts.append(
+        lump("palm", (at(-20, -9, 12), 0.35 * thumb[0] + 0.65 * thumb[1] + at(0, -2, -4)), (13.0, 7.5), 0.014)
+    )
+    parts.append(lump("palm", (at(-12, -8, -19), at(-58, -9, -32)), (14.0, 10.5), 0.014))
+    pad = np.array([-0.004, -0.0060, 0.0]) * size
+    parts.append(lump("palm", (points[1] + pad, points[10] + pad), (8.0, 7.0), 0.016))
+    parts.append(lump("palm", (points[10] + pad, points[7] + pad * 0.9), (6.5, 6.0), 0.016))
+    web = (0.3 * thumb[0] + 0.7 * thumb[1], 0.45 * points[1] + np.array([0.0, -0.006, 0.0]) * size)
+    parts.append(lump("palm", web, (7.0, 8.0), 0.020))
+    web = (0.25 * thumb[0] + 0.75 * thumb[1], 0.72 * points[1] + np.array([0.0, -0.005, 0.0]) * size)
+    parts.append(lump("palm", web, (4.0, 7.5), 0.020))
+    half = np.array([[28.0, 16.5, 20.5], [27.0, 15.0, 20.0], [27.5, 12.5, 19.0]]) * wrist * 1e-3
+    line = np.array([[0.060, -0.002, -0.002], [0.012, -0.001, -0.002], [-0.012, -0.001, -0.001]]) * size
+    parts.append(Tissue("wrist", line, half, up, 0.012 * size, 0.022 * size))
+    return parts
+
+
+def _digit(
+    name: str,
+    points: Vector,
+    sections: tuple[tuple[float, ...], ...],
+    scale: float,
+    back: Vector,
+    tip: float,
+    blend: float,
+) -> Tissue:
+    """A digit as one tissue: cross-sections along its joints, the round tip ending at its tip point."""
+    chain = digit_line(points, name)
+    along = (chain[3] - chain[2]) / np.linalg.norm(chain[3] - chain[2])
+    # The last cross-section lies one tip length before the end, whatever the finger's length.
+    end = chain[3] - along * tip * scale * 1e-3
+    line = []
+    for place, *_ in sections[:-1]:
+        joint = int(place)
+        line.append(chain[joint] + (place - joint) * (chain[joint + 1] - chain[joint]))
+    line.append(end)
+    heights = np.array(sections)[:, 1:] * scale * 1e-3
+    across = back - along * (back @ along)
+    return Tissue(name, np.array(line), heights, across / np.linalg.norm(across), tip * scale * 1e-3, blend)

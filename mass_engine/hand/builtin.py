@@ -26,7 +26,7 @@ _FINGER_LIMITS = (
     ((-15, 85), (-3, 3), (-5, 5)),
 )
 _THUMB_LIMITS = (
-    ((-40, 40), (-40, 40), (-30, 30)),
+    ((-40, 55), (-40, 40), (-30, 30)),
     ((-20, 60), (-12, 12), (-10, 10)),
     ((-30, 90), (-5, 5), (-6, 6)),
 )
@@ -36,6 +36,11 @@ def load_builtin(side: Side) -> HandModel:
     """The built-in hand of ``side``; the left one is the right one mirrored."""
     tensors = load_file(DATA_FILE)
     tensors["faces"] = tensors["faces"].long()
+    # 1 - cos(angle) is half of what the diagonal of R - I lacks, whatever the axis.
+    bends = tensors.pop("bend_shapes")
+    pose_basis = torch.zeros(*bends.shape, 9)
+    pose_basis[..., [0, 4, 8]] = -0.5 * bends.unsqueeze(-1)
+    tensors["pose_basis"] = pose_basis.flatten(2)
     right = HandModel.from_tensors("right", tensors)
     return right if side == "right" else right.mirrored()
 
@@ -49,8 +54,9 @@ def joint_limits() -> Tensor:
 def joint_frames(model: HandModel) -> Tensor:
     """[15,3,3]: rows are each finger joint's flexion, abduction and twist axes at rest.
 
-    The dot product of a joint's axis-angle with a row is its angle about that axis (exact for one axis alone);
-    positive flexion closes the hand. The twist axis points along the finger.
+    The dot product of a joint's axis-angle with a row is its angle about that axis (exact for one axis
+    alone). Positive flexion closes the hand, positive abduction moves a finger towards the thumb, the twist
+    axis points along the finger.
     """
     # Angles are the same on both sides when the left axes are the right ones mirrored as rotations are.
     right = model if model.side == "right" else model.mirrored()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from mass_engine.errors import EngineError
 from mass_engine.hand.pose import TIP_PARENTS, HandPose, Side
-from mass_engine.hand.rotation import rodrigues
+from mass_engine.hand.rotation import axis_angle_to_matrix as axis_angle_to_matrix
 
 _KNUCKLES = [1, 4, 7, 10, 13]
 _MIDDLE = [2, 5, 8, 11, 14]
@@ -17,17 +18,22 @@ _LAST = [3, 6, 9, 12, 15]
 #: Chain order (three levels of five) back to joint order.
 _FROM_LEVELS = [0, 1, 6, 11, 2, 7, 12, 3, 8, 13, 4, 9, 14, 5, 10, 15]
 
+_REQUIRED = (
+    "template", "faces", "shape_basis", "joint_template", "joint_shape_basis", "weights",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class PosedHand:
-    """A hand in a pose: ``vertices`` [...,V,3], ``joints`` [...,21,3] in metres, and ``bones`` [...,16,4,4].
+    """A hand in a pose: ``vertices`` [...,V,3], ``joints`` [...,21,3] in metres, and
+    ``bone_transforms`` [...,16,4,4].
 
-    ``bones`` take a point of the shaped rest hand to where that bone carries it.
+    ``bone_transforms`` take a point of the shaped rest hand to where that bone carries it.
     """
 
     vertices: Tensor
     joints: Tensor
-    bones: Tensor
+    bone_transforms: Tensor
 
 
 @dataclass(frozen=True)
@@ -37,9 +43,7 @@ class HandModel:
     ``template`` [V,3]; ``faces`` [F,3] int64, counter-clockwise seen from outside; ``shape_basis``
     [V,3,10]; ``joint_template`` [21,3] (16 joints, 5 tips, at rest, mean shape); ``joint_shape_basis``
     [21,3,10]; ``weights`` [V,16], rows sum to one; ``pose_basis`` [V,3,135] or None multiplies the
-    flattened R - I of the 15 finger joints; ``cap_faces`` [C] int64 are the faces closing the wrist;
-    ``joint_frames`` [15,3,3]: columns are each joint's flexion, abduction and twist axes at rest;
-    ``joint_limits`` [15,3,2]: least and greatest radians about them.
+    flattened R - I of the 15 finger joints.
 
     ``global_orient`` turns the hand about its wrist joint, ``transl`` is added last
     (Romero et al. 2017, Embodied Hands, section 3).
@@ -52,15 +56,18 @@ class HandModel:
     joint_template: Tensor
     joint_shape_basis: Tensor
     weights: Tensor
-    cap_faces: Tensor
-    joint_frames: Tensor
-    joint_limits: Tensor
     pose_basis: Tensor | None = None
 
-    @property
-    def wrist_vertices(self) -> Tensor:
-        """Indices [K] of the vertices that belong to the wrist cap."""
-        return self.faces[self.cap_faces].flatten().unique()
+    @staticmethod
+    def from_tensors(side: Side, tensors: Mapping[str, Tensor]) -> HandModel:
+        """The model whose :meth:`tensors` these are. Raises KeyError when one is missing."""
+        required = {name: tensors[name] for name in _REQUIRED}
+        return HandModel(side, **required, pose_basis=tensors.get("pose_basis"))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything but the side, by name, for a file."""
+        result = {name: getattr(self, name) for name in _REQUIRED}
+        return result if self.pose_basis is None else {**result, "pose_basis": self.pose_basis}
 
     def __call__(self, pose: HandPose) -> tuple[Tensor, Tensor]:
         """Vertices [...,V,3] and joints [...,21,3] of ``pose``; differentiable, any leading dimensions."""
@@ -78,20 +85,18 @@ class HandModel:
         """Pose the hand; ``offsets`` [V,3] or [...,V,3] metres move the rest vertices before skinning."""
         self._check(pose)
         rest = self._rest_joints(pose.betas)
-        shaped = self.template + (self.shape_basis.flatten(0, 1) @ pose.betas.unsqueeze(-1)).unflatten(
-            -2, self.template.shape
-        ).squeeze(-1)
+        shaped = self.template + _combine(self.shape_basis, pose.betas)
         if offsets is not None:
             shaped = shaped + offsets
         rotations = _local_rotations(pose)
         if self.pose_basis is not None:
             bend = (rotations[..., 1:, :, :] - torch.eye(3).to(rotations)).flatten(-3)
-            moved = bend @ self.pose_basis.flatten(0, 1).T
-            shaped = shaped + moved.unflatten(-1, self.template.shape)
+            shaped = shaped + _combine(self.pose_basis, bend)
         turns, places = _chain(rotations, rest)
         shifts = places - (turns @ rest[..., :16, :].unsqueeze(-1)).squeeze(-1) + pose.transl.unsqueeze(-2)
         blended = self.weights @ torch.cat((turns.flatten(-2), shifts), -1)
-        turned = (blended[..., :9].unflatten(-1, (3, 3)) @ shaped.unsqueeze(-1)).squeeze(-1)
+        turn = blended[..., :9].reshape(*blended.shape[:-1], 3, 3)
+        turned = (turn * shaped.unsqueeze(-2)).sum(-1)
         points = _points(turns, places, rest) + pose.transl.unsqueeze(-2)
         upper = torch.cat((turns, shifts.unsqueeze(-1)), -1)
         lower = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(upper).expand(*upper.shape[:-2], 1, 4)
@@ -113,8 +118,6 @@ class HandModel:
             shape_basis=self.shape_basis * flip[:, None],
             joint_template=self.joint_template * flip,
             joint_shape_basis=self.joint_shape_basis * flip[:, None],
-            # An axis is a pseudo-vector: mirrored and negated.
-            joint_frames=self.joint_frames * -flip[:, None],
             pose_basis=pose_basis,
         )
 
@@ -122,14 +125,12 @@ class HandModel:
         """The same model elsewhere; ``dtype`` changes the floating-point tensors only."""
         moved = {
             name: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-            for name, value in vars(self).items()
-            if isinstance(value, Tensor)
+            for name, value in self.tensors().items()
         }
-        return replace(self, **moved)
+        return HandModel.from_tensors(self.side, moved)
 
     def _rest_joints(self, betas: Tensor) -> Tensor:
-        moved = self.joint_shape_basis.flatten(0, 1) @ betas.unsqueeze(-1)
-        return self.joint_template + moved.unflatten(-2, self.joint_template.shape).squeeze(-1)
+        return self.joint_template + _combine(self.joint_shape_basis, betas)
 
     def _check(self, pose: HandPose) -> None:
         sizes = {"betas": 10, "global_orient": 3, "hand_pose": 45, "transl": 3}
@@ -149,29 +150,31 @@ class HandModel:
             )
 
 
-def mirrored_pose(pose: HandPose) -> HandPose:
-    """The pose of the other hand that looks like ``pose`` in a mirror across the plane x = 0."""
-    turn = torch.tensor([1.0, -1.0, -1.0]).to(pose.transl)
-    return HandPose(
-        betas=pose.betas,
-        global_orient=pose.global_orient * turn,
-        hand_pose=(pose.hand_pose.unflatten(-1, (15, 3)) * turn).flatten(-2),
-        transl=pose.transl * -turn,
-        side="left" if pose.side == "right" else "right",
-    )
+def mirror_pose(axis_angles: Tensor) -> Tensor:
+    """Axis-angles [...,3 n] of one side to those of the other (mirrored in x: y and z change sign)."""
+    turn = torch.tensor([1.0, -1.0, -1.0]).to(axis_angles)
+    return axis_angles * turn.repeat(axis_angles.shape[-1] // 3)
+
+
+def _combine(basis: Tensor, coefficients: Tensor) -> Tensor:
+    """``basis`` [P,3,K] times ``coefficients`` [...,K] -> [...,P,3]."""
+    moved = coefficients @ basis.flatten(0, 1).T
+    return moved.reshape(*coefficients.shape[:-1], *basis.shape[:2])
 
 
 def _local_rotations(pose: HandPose) -> Tensor:
     """[...,16,3,3]: the wrist's, then the 15 joints', each in its parent's frame."""
-    lead = torch.broadcast_shapes(pose.global_orient.shape[:-1], pose.hand_pose.shape[:-1])
-    wrist = pose.global_orient.expand(*lead, 3).unsqueeze(-2)
-    fingers = pose.hand_pose.expand(*lead, 45).unflatten(-1, (15, 3))
-    return rodrigues(torch.cat((wrist, fingers), -2))
+    wrist, fingers = pose.global_orient, pose.hand_pose
+    if wrist.shape[:-1] != fingers.shape[:-1]:
+        lead: tuple[int, ...] = torch.broadcast_shapes(wrist.shape[:-1], fingers.shape[:-1])  # type: ignore[no-untyped-call]
+        wrist, fingers = wrist.expand(*lead, 3), fingers.expand(*lead, 45)
+    vectors = torch.cat((wrist, fingers), -1)
+    return axis_angle_to_matrix(vectors.reshape(*vectors.shape[:-1], 16, 3))
 
 
 def _chain(rotations: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
     """Absolute rotations [...,16,3,3] and joint places [...,16,3]; all five fingers a level at a time."""
-    lead = torch.broadcast_shapes(rotations.shape[:-3], rest.shape[:-2])
+    lead: tuple[int, ...] = torch.broadcast_shapes(rotations.shape[:-3], rest.shape[:-2])  # type: ignore[no-untyped-call]
     turn = rotations[..., :1, :, :].expand(*lead, 1, 3, 3)
     place = rest[..., :1, :].expand(*lead, 1, 3)
     turns, places = [turn], [place]

@@ -9,7 +9,7 @@ from torch import Tensor
 _SMALL = 1e-6
 
 
-def rodrigues(axis_angle: Tensor) -> Tensor:
+def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     """Axis-angle [...,3] in radians to rotation matrices [...,3,3] (Rodrigues' formula).
 
     R = I + a [w] + b [w]^2 with a = sin t / t and b = (1 - cos t) / t^2. The half-angle form of b keeps
@@ -27,7 +27,7 @@ def rodrigues(axis_angle: Tensor) -> Tensor:
     xy, xz, yz = bx * y, bx * z, by * z
     xx, yy, zz = bx * x, by * y, b * z * z
     rows = (1 - yy - zz, xy - az, xz + ay, xy + az, 1 - xx - zz, yz - ax, xz - ay, yz + ax, 1 - xx - yy)
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return torch.stack(rows, -1).reshape(*axis_angle.shape[:-1], 3, 3)
 
 
 def axis_angle_from_matrix(rotation: Tensor) -> Tensor:

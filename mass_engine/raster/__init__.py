@@ -1,11 +1,12 @@
 """2-D Gaussian surfel rasteriser (2DGS, Huang et al. 2024), exact and differentiable.
 
-``rasterize`` is the whole interface. Two implementations stand behind it: ``reference`` (plain torch, any dtype, the
-specification) and ``cpu`` (C++ kernels). Colours come in evaluated; spherical harmonics belong to the caller.
+``rasterize`` is the whole interface. Two implementations stand behind it: ``reference`` (plain torch, any
+dtype, the specification) and ``cpu`` (C++ kernels). Colours come in evaluated; spherical harmonics belong to
+the caller.
 
-Conventions: surfel axes are the columns of the rotation of ``quats`` (w, x, y, z; any length), the disk lies in the
-first two, the third is its normal; ``scales`` are standard deviations. Pixel (column i, row j) has its centre at
-(i + 0.5, j + 0.5). Surfels are blended in order of their centre's camera z, ties by index.
+Conventions: surfel axes are the columns of the rotation of ``quats`` (w, x, y, z; any length), the disk lies
+in the first two, the third is its normal; ``scales`` are standard deviations. Pixel (column i, row j) has its
+centre at (i + 0.5, j + 0.5). Surfels are blended in order of their centre's camera z, ties by index.
 """
 
 from __future__ import annotations
@@ -36,10 +37,11 @@ def rasterize(
 ) -> RenderOutput:
     """Render surfels: means [N,3], quats [N,4] wxyz, scales [N,2], opacities [N] in 0..1, colors [N,3].
 
-    ``background`` [3] or [H,W,3] goes behind (none: black, so ``rgb`` is premultiplied). Gradients reach every tensor
-    argument and ``camera.world_to_camera`` and ``camera.K`` (its upper two rows; the third is taken as 0, 0, 1).
-    The "cpu" backend computes in float32 and is deterministic bit for bit whatever the number of threads.
-    Raises ``BadArgumentError`` (``raster.shape``, ``raster.device``, ``raster.image_size``, ...).
+    ``background`` [3] or [H,W,3] goes behind (none: black, so ``rgb`` is premultiplied). Gradients reach
+    every tensor argument and ``camera.world_to_camera`` and ``camera.K`` (its upper two rows; the third is
+    taken as 0, 0, 1). The "cpu" backend computes in float32 and is deterministic bit for bit whatever the
+    number of threads. Raises ``BadArgumentError`` (``raster.shape``, ``raster.device``,
+    ``raster.image_size``, ...).
     """
     options = options or RasterOptions()
     options.check()
@@ -82,8 +84,14 @@ def _check(
             )
         if tensor.device.type != "cpu":
             raise BadArgumentError(
-                "raster.device", f"{name} is on {tensor.device}.", "Move it to the CPU: there is no GPU kernel yet."
+                "raster.device",
+                f"{name} is on {tensor.device}.",
+                "Move it to the CPU.",
             )
+    if not bool(camera.K.isfinite().all()) or not bool(camera.world_to_camera.isfinite().all()):
+        raise BadArgumentError(
+            "raster.camera", "The camera holds NaN or infinity.", "Check K and world_to_camera."
+        )
     if n >= _MOST_SURFELS:
         raise BadArgumentError("raster.count", f"{n} surfels.", f"Render fewer than {_MOST_SURFELS}.")
     if not (0 < camera.width <= _LARGEST_SIDE and 0 < camera.height <= _LARGEST_SIDE):

@@ -1,11 +1,12 @@
 """The compiled CPU kernels behind an autograd function.
 
-The kernels (``kernels/``, C++17) work in passes: project surfels, order them by depth (radix sort), list them per
-16 x 16 tile, blend each tile front to back; the backward pass blends each tile back to front into one record per
-(surfel, tile) pair, then adds a surfel's records in a fixed order and applies the chain rule. Every sum has a fixed
-order, hence the same bits with any number of threads. A vector is a 4 x 4 block of pixels: hand surfels are a few
-pixels wide, and a square block wastes fewer lanes on them than a row. The same code is compiled for AVX-512, AVX2
-and plain vectors, and chosen at run time.
+The kernels (``kernels/``, C++17) work in passes: project surfels, list them per 16 x 16 tile, order each
+tile's list by depth, blend it front to back. The backward pass blends each tile back to front into one record
+per (surfel, tile) pair, then adds a surfel's records in a fixed order and applies the chain rule. Every sum
+has a fixed order, hence the same bits with any number of threads. A vector is a 4 x 4 block of pixels: hand
+surfels are a few pixels wide, and a square block wastes fewer lanes on them than a row. A surfel so small on
+screen that only its low-pass part can show takes a shorter path with the same result. The same code is
+compiled for AVX-512, AVX2 and plain vectors, and chosen at run time.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ def rasterize(
 ) -> RenderOutput:
     """As ``mass_engine.raster.rasterize``, in float32 and without background."""
     renderer = renderer or shared_renderer()
-    tensors = (means, quats, scales, opacities, colors, camera.world_to_camera, camera.K)
-    tensors = tuple(t.to(torch.float32).contiguous() for t in tensors)
+    given = (means, quats, scales, opacities, colors, camera.world_to_camera, camera.K)
+    tensors = [t.to(torch.float32).contiguous() for t in given]
     differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     call = _Call(renderer, camera.width, camera.height, options, differentiable)
     rgb, alpha, depth, *more = _Rasterize.apply(call, *tensors)  # type: ignore[no-untyped-call]
@@ -59,7 +60,12 @@ class _Call:
     """The arguments of one forward pass that are not tensors, and its count of dropped surfels."""
 
     def __init__(
-        self, renderer: _kernels.Renderer, width: int, height: int, options: RasterOptions, differentiable: bool
+        self,
+        renderer: _kernels.Renderer,
+        width: int,
+        height: int,
+        options: RasterOptions,
+        differentiable: bool,
     ) -> None:
         self.renderer = renderer
         self.width, self.height = width, height
@@ -74,58 +80,102 @@ def _camera_numbers(world_to_camera: Tensor, K: Tensor, options: RasterOptions) 
     k: list[list[float]] = K.tolist()
     rotation = [x for row in pose[:3] for x in row[:3]]
     translation = [row[3] for row in pose[:3]]
-    return [*rotation, *translation, *k[0][:2], *k[1][:2], k[0][2], k[1][2], options.near, options.distortion_scale]
+    return [
+        *rotation,
+        *translation,
+        *k[0][:2],
+        *k[1][:2],
+        k[0][2],
+        k[1][2],
+        options.near,
+        options.distortion_scale,
+    ]
+
+
+def _empty(*shape: int) -> Tensor:
+    return torch.empty(shape, dtype=torch.float32)
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, call: _Call, *tensors: Tensor) -> tuple[Tensor, ...]:
-        surfels = [t.detach() for t in tensors[:5]]
+        means, quats, scales, opacities, colors, pose, K = (t.detach() for t in tensors)
         H, W, options = call.height, call.width, call.options
-        rgb, alpha, depth = torch.empty(H, W, 3), torch.empty(H, W), torch.empty(H, W)
-        extras: list[Tensor] = []
+        rgb, alpha, depth = _empty(H, W, 3), _empty(H, W), _empty(H, W)
+        median = normal = distortion = weights = None
         if options.outputs == "all":
-            extras = [torch.empty(H, W), torch.empty(H, W, 3), torch.empty(H, W), torch.empty(len(surfels[0]))]
+            median, normal, distortion = _empty(H, W), _empty(H, W, 3), _empty(H, W)
+            weights = _empty(len(means))
         try:
             frame = call.renderer.forward(
-                _camera_numbers(tensors[5], tensors[6], options),
+                _camera_numbers(pose, K, options),
                 W,
                 H,
                 options.cull_backfaces,
-                *surfels,
+                means,
+                quats,
+                scales,
+                opacities,
+                colors,
                 rgb,
                 alpha,
                 depth,
-                *(extras or [None] * 4),
+                median,
+                normal,
+                distortion,
+                weights,
                 call.differentiable,
                 call.threads,
             )
         except _kernels.TooManyPairsError as error:
             raise EngineError(
-                "raster.too_many_pairs", f"The scene needs {error}.", "Render smaller surfels or a smaller image."
+                "raster.too_many_pairs",
+                f"The scene needs {error}.",
+                "Render smaller surfels or a smaller image.",
             ) from error
         call.dropped = frame.dropped
         if call.differentiable:
             ctx.call, ctx.frame = call, frame
             ctx.save_for_backward(*tensors, alpha, depth)
             ctx.set_materialize_grads(False)
-            if extras:
-                ctx.mark_non_differentiable(extras[3])
-        return (rgb, alpha, depth, *extras)
+            if weights is not None:
+                ctx.mark_non_differentiable(weights)
+        extras = (median, normal, distortion, weights)
+        return (rgb, alpha, depth, *(t for t in extras if t is not None))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        *tensors, alpha, depth = ctx.saved_tensors
+        means, quats, scales, opacities, colors, _, _, alpha, depth = (t.detach() for t in ctx.saved_tensors)
         call: _Call = ctx.call
-        surfels = [t.detach() for t in tensors[:5]]
         images = [None if g is None else g.contiguous() for g in gradients[:6]]
-        images += [None] * (6 - len(images))
-        out = [torch.empty_like(t) for t in surfels]
-        d_camera = torch.empty(18)
+        d_rgb, d_alpha, d_depth, d_median, d_normal, d_distortion = images + [None] * (6 - len(images))
+        out = [torch.empty_like(t) for t in (means, quats, scales, opacities, colors)]
+        d_means, d_quats, d_scales, d_opacities, d_colors = out
+        d_camera = _empty(18)
         call.renderer.backward(
-            ctx.frame, *surfels, alpha.detach(), depth.detach(), *images, *out, d_camera, call.threads
+            ctx.frame,
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            alpha,
+            depth,
+            d_rgb,
+            d_alpha,
+            d_depth,
+            d_median,
+            d_normal,
+            d_distortion,
+            d_means,
+            d_quats,
+            d_scales,
+            d_opacities,
+            d_colors,
+            d_camera,
+            call.threads,
         )
-        d_pose, d_K = torch.zeros(4, 4), torch.zeros(3, 3)
+        d_pose, d_K = d_camera.new_zeros(4, 4), d_camera.new_zeros(3, 3)
         d_pose[:3, :3] = d_camera[:9].view(3, 3)
         d_pose[:3, 3] = d_camera[9:12]
         d_K[:2, :2] = d_camera[12:16].view(2, 2)

@@ -1,7 +1,7 @@
-"""The specification of the rasteriser in plain torch: every surfel at every pixel, any dtype, autograd for gradients.
+"""The specification of the rasteriser in plain torch: every surfel at every pixel, any dtype, autograd.
 
-Slow on purpose: it has no tiles, no bounds and no early exit, so that it can be read and trusted. The compiled kernels
-are held against it in value and in gradient.
+Slow on purpose: it has no tiles, no bounds and no early exit, so that it can be read and trusted. The
+compiled kernels are held against it in value and in gradient.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _ELEMENTS_PER_CHUNK = 1 << 21
 class ProjectedSurfels:
     """The surfels that can be seen, nearest first (M of them).
 
-    With d the pixel minus ``center`` [M,2] and pz = 1 + g.d, the ray through a pixel meets the disk's plane at disk
-    coordinates (u, v) = ab d / pz (in standard deviations) and at depth z / pz. This is the splat-to-pixel matrix of
-    2DGS (eq. 7-9) inverted and taken relative to the projected centre.
+    With d the pixel minus ``center`` [M,2] and pz = 1 + g.d, the ray through a pixel meets the disk's plane
+    at disk coordinates (u, v) = ab d / pz (in standard deviations) and at depth z / pz. This is the
+    splat-to-pixel matrix of 2DGS (eq. 7-9) inverted and taken relative to the projected centre.
     """
 
     index: Tensor  # [M] row in the input
@@ -100,9 +100,7 @@ def project(
     ab = z[:, None, None] / scales[index][:, :, None] * G
     g = -(axes[:, 2:, :2] @ G)[:, 0]
     normal = torch.where((facing > 0)[:, None], -normal, normal)
-    projected = ProjectedSurfels(
-        index, center, ab, g, z, solid, normal, opacities[index], colors[index]
-    )
+    projected = ProjectedSurfels(index, center, ab, g, z, solid, normal, opacities[index], colors[index])
     return projected, int((~usable).sum())
 
 
@@ -170,13 +168,14 @@ def rasterize(
 ) -> RenderOutput:
     """As ``mass_engine.raster.rasterize``, in the dtype of ``means`` and without background."""
     dtype, H, W = means.dtype, camera.height, camera.width
-    inputs = (t.to(dtype) for t in (means, quats, scales, opacities, colors))
     camera = Camera(camera.K.to(dtype), camera.world_to_camera.to(dtype), W, H)
-    surfels, dropped = project(*inputs, camera, options)
+    surfels, dropped = project(
+        means, quats.to(dtype), scales.to(dtype), opacities.to(dtype), colors.to(dtype), camera, options
+    )
     y, x = torch.meshgrid(torch.arange(H, dtype=dtype), torch.arange(W, dtype=dtype), indexing="ij")
     pixels = torch.stack([x, y], -1).reshape(-1, 2) + 0.5
     size = max(1, _ELEMENTS_PER_CHUNK // max(1, len(surfels.z)))
-    parts = [_blend(surfels, chunk, options) for chunk in pixels.split(size)]
+    parts = [_blend(surfels, chunk, options) for chunk in torch.split(pixels, size)]
 
     def image(name: str, *channels: int) -> Tensor:
         return torch.cat([getattr(p, name) for p in parts]).reshape(H, W, *channels)

@@ -26,10 +26,11 @@ class RasterOptions:
     """How to rasterise.
 
     ``outputs``: "color" is rgb, alpha and depth; "all" adds median depth, normal, distortion and weight_sum.
-    ``near``: surfels whose centre is nearer than this (scene units) are dropped, parts of a disk nearer than this
-    are not met by their rays. ``cull_backfaces`` drops surfels whose normal (third axis) points away from the
-    camera. ``distortion_range``: the near and far that map depth to [0, 1] in the distortion output; take them
-    around the object, or its value is numerically dead. ``threads``: None is every core this process may use.
+    ``near``: surfels whose centre is nearer than this (scene units) are not drawn, parts of a disk nearer
+    than this are not met by their rays. ``cull_backfaces`` drops surfels whose normal (third axis) points
+    away from the camera. ``distortion_range``: the near and far that map depth to [0, 1] in the distortion
+    output; take them around the object, or its value is numerically dead. ``threads``: None is every core
+    this process may use.
     """
 
     backend: Backend = "auto"
@@ -43,7 +44,9 @@ class RasterOptions:
         """Raise ``BadArgumentError`` when a value makes no sense."""
         if self.backend not in ("auto", "cpu", "reference"):
             raise BadArgumentError(
-                "raster.backend", f"There is no backend {self.backend!r}.", "Use 'auto', 'cpu' or 'reference'."
+                "raster.backend",
+                f"No backend {self.backend!r}.",
+                "Use 'auto', 'cpu' or 'reference'.",
             )
         if self.outputs not in ("color", "all"):
             raise BadArgumentError(
@@ -84,9 +87,10 @@ class RenderOutput:
     ``rgb`` [H,W,3] over the background (premultiplied colour without one); ``alpha`` [H,W];
     ``depth`` [H,W] sum(w z) / alpha, 0 where alpha is 0; ``dropped`` counts surfels left out because of NaN,
     infinite, zero or negative numbers.
-    With ``outputs="all"``: ``median_depth`` [H,W] (0 where nothing was met); ``normal`` [H,W,3] sum(w n) in camera
-    coordinates, each n turned to the camera; ``distortion`` [H,W] sum over pairs of w_i w_j (m_i - m_j)^2;
-    ``weight_sum`` [N] sum of each surfel's blending weights over the image (no gradient; 0 is not visible).
+    With ``outputs="all"``: ``median_depth`` [H,W] (0 where nothing was met); ``normal`` [H,W,3] sum(w n) in
+    camera coordinates, each n turned to the camera; ``distortion`` [H,W] sum over pairs of w_i w_j (m_i -
+    m_j)^2; ``weight_sum`` [N] sum of each surfel's blending weights over the image (no gradient; 0 is not
+    visible).
     """
 
     rgb: Tensor

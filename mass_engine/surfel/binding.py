@@ -12,8 +12,7 @@ from mass_engine.surfel.densify import fractal_corners
 from mass_engine.surfel.inellipse import (
     CONJUGATE,
     SIGMA_PER_SEMI_AXIS,
-    matrix_to_quat,
-    principal_axes,
+    principal_scales_quats,
     safe_norm,
 )
 from mass_engine.surfel.subdivision import Subdivision, loop_subdivision
@@ -21,8 +20,11 @@ from mass_engine.surfel.subdivision import Subdivision, loop_subdivision
 
 @dataclass(frozen=True)
 class AttachedSurfels:
-    """Surfels [...,N] of posed meshes: ``means`` [...,N,3] and ``tangents`` [...,N,2,3], the disk's points
-    being mean + u tangent_0 + v tangent_1 with weight exp(-(u^2 + v^2) / 2); ``normals`` [...,N,3] outward."""
+    """Surfels [...,N] of posed meshes: ``means`` [...,N,3], ``tangents`` [...,N,2,3], ``normals`` [...,N,3].
+
+    The disk's points are mean + u tangent_0 + v tangent_1 with weight exp(-(u^2 + v^2) / 2); normals face
+    outward.
+    """
 
     means: Tensor
     tangents: Tensor
@@ -30,8 +32,7 @@ class AttachedSurfels:
 
     def scales_quats(self) -> tuple[Tensor, Tensor]:
         """Standard deviations [...,N,2] along the principal axes and their rotation, quats [...,N,4] wxyz."""
-        scales, rotation = principal_axes(self.tangents[..., 0, :], self.tangents[..., 1, :])
-        return scales, matrix_to_quat(rotation)
+        return principal_scales_quats(self.tangents[..., 0, :], self.tangents[..., 1, :])
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class MeshBinding:
     per_face: int
     surfel_faces: Tensor
     bones: Tensor
-    _rows: Tensor  # [3 K,3]: centroid, tangent 0, tangent 1 of each small triangle from a face's corners
+    _parts: Tensor  # [9,9 K]: a face's corners (flat) to mean and tangents of each of its small triangles
 
     @staticmethod
     def build(model: HandModel, levels: int, depth: int) -> MeshBinding:
@@ -60,6 +61,7 @@ class MeshBinding:
         conjugate[1:] *= SIGMA_PER_SEMI_AXIS
         # Tangent order (Q, P): their cross product is the outward normal.
         rows = (conjugate[[0, 2, 1]] @ corners).reshape(-1, 3)
+        parts = torch.kron(rows.T.contiguous(), torch.eye(3))
         weights = subdivision.apply(model.weights)
         bones = weights[subdivision.faces].mean(1).argmax(-1)
         count = len(corners)
@@ -71,7 +73,7 @@ class MeshBinding:
             count,
             subdivision.face_parent.repeat_interleave(count),
             bones.repeat_interleave(count),
-            rows,
+            parts,
         )
 
     @property
@@ -81,11 +83,15 @@ class MeshBinding:
 
     def surfels(self, vertices: Tensor) -> AttachedSurfels:
         """Attached surfels of posed base-mesh vertices [...,V,3]; differentiable."""
-        refined = self.subdivision.apply(vertices)
-        triangles = refined[..., self.subdivision.faces, :]
-        lead = triangles.shape[:-3]
-        both = (self._rows @ triangles).reshape(*lead, self.count, 3, 3)
-        a, b, c = triangles.unbind(-2)
+        return self.register(self.subdivision.apply(vertices))
+
+    def register(self, refined: Tensor) -> AttachedSurfels:
+        """Attached surfels of the refined mesh's vertices [...,V',3]; differentiable."""
+        lead = refined.shape[:-2]
+        corners = refined.index_select(-2, self.subdivision.faces.flatten())
+        # One product for all: [faces, 9 numbers] times the fixed map, whose output is in surfel order.
+        both = (corners.reshape(*lead, -1, 9) @ self._parts).reshape(*lead, self.count, 3, 3)
+        a, b, c = corners.reshape(*lead, -1, 3, 3).unbind(-2)
         normals = torch.linalg.cross(b - a, c - a)
         normals = normals / safe_norm(normals).unsqueeze(-1)
         # The small triangles of a face lie in its plane.

@@ -43,7 +43,12 @@ class SurfelCloud:
                     f"{name} is {tuple(getattr(self, name).shape)}, not {shape}.",
                     "Give one row per surfel.",
                 )
-        if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[1] not in SH_COUNTS or self.sh.shape[2] != 3:
+        if (
+            self.sh.ndim != 3
+            or self.sh.shape[0] != n
+            or self.sh.shape[1] not in SH_COUNTS
+            or self.sh.shape[2] != 3
+        ):
             raise EngineError(
                 "surfels.shape", f"sh is {tuple(self.sh.shape)}.", "Give [N,K,3] with K = 1, 4, 9 or 16."
             )

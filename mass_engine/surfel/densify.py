@@ -1,4 +1,4 @@
-"""Fractal densification: a face's own inellipse and, in the corners it leaves free, those of smaller triangles."""
+"""Fractal densification: a face's own inellipse and, in the corners it leaves free, smaller triangles'."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 #: Standard deviation of a surfel per semi-axis of its inellipse.
 SIGMA_PER_SEMI_AXIS = 1.0
@@ -30,30 +31,56 @@ def conjugate_axes(triangles: Tensor) -> Tensor:
     return torch.tensor(CONJUGATE, dtype=triangles.dtype) @ triangles
 
 
-def principal_axes(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-    """Semi-axes [...,2] (long, short) and their unit directions with the normal, a rotation [...,3,3] by columns.
+def principal_scales_quats(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Semi-axes [...,2] (long, short) and unit quats [...,4] (wxyz) of their directions, normal third.
 
-    ``p``, ``q`` [...,3] are conjugate half-diameters. The extremes of |P cos t + Q sin t| lie at
-    tan 2t = 2 P.Q / (|P|^2 - |Q|^2), which is the 2x2 symmetric eigen-problem in closed form. Values and
-    gradients stay finite for circles (any axes serve) and for degenerate triangles.
+    ``p``, ``q`` [...,3] are conjugate half-diameters; the normal is along ``p`` x ``q``. Values and gradients
+    stay finite for circles (any axes serve) and for degenerate triangles. The plane's own axes come from its
+    normal without a branch (Duff et al. 2017, "Building an orthonormal basis, revisited"); within it the 2x2
+    eigen-problem is solved in closed form, and the quaternion is the normal's times the turn in the plane.
     """
-    cross = 2 * (p * q).sum(-1)
-    difference = (p * p).sum(-1) - (q * q).sum(-1)
-    # atan2 has no gradient at the origin: there (a circle) every angle is right, take 0.
-    circle = (cross.abs() + difference.abs()) < 1e-12 * ((p * p).sum(-1) + (q * q).sum(-1)) + 1e-30
-    angle = 0.5 * torch.atan2(
-        torch.where(circle, torch.zeros_like(cross), cross),
-        torch.where(circle, torch.ones_like(difference), difference),
+    normal = torch.linalg.cross(p, q)
+    length = safe_norm(normal)
+    flat = length < 1e-10 * ((p * p).sum(-1) + (q * q).sum(-1)) + 2e-12
+    n = normal / length.unsqueeze(-1)
+    if bool(flat.any()):  # slivers have no normal of their own: any direction across them will do
+        long = torch.where(((p * p).sum(-1) > (q * q).sum(-1)).unsqueeze(-1), p, q).detach()
+        n = torch.where(flat.unsqueeze(-1), _across(long), n)
+    nx, ny, nz = n.unbind(-1)
+    upper = nz >= 0
+    sign = torch.where(upper, 1.0, -1.0).to(nz.dtype)
+    a = -1 / (sign + nz)
+    b = nx * ny * a
+    first = (1 + sign * nx * nx * a, sign * b, -sign * nx)
+    second = (b, sign + ny * ny * a, -ny)
+    px, py, pz = p.unbind(-1)
+    qx, qy, qz = q.unbind(-1)
+    p1, p2 = (px * e[0] + py * e[1] + pz * e[2] for e in (first, second))
+    q1, q2 = (qx * e[0] + qy * e[1] + qz * e[2] for e in (first, second))
+    xx, xy, yy = p1 * p1 + q1 * q1, p1 * p2 + q1 * q2, p2 * p2 + q2 * q2
+    half_difference = 0.5 * (xx - yy)
+    # A circle has no axes: there any angle is right and the gradient of it is left out.
+    circle = half_difference.abs() + xy.abs() < 1e-6 * (xx + yy) + 1e-30
+    y = torch.where(circle, torch.zeros_like(xy), xy)
+    x = torch.where(circle, torch.ones_like(xy), half_difference)
+    # x and y may be far below one: their squares must not vanish.
+    unit = (x.abs() + y.abs()).detach()
+    spread = torch.where(
+        circle, torch.zeros_like(xy), unit * ((x / unit).square() + (y / unit).square()).sqrt()
     )
-    cos, sin = angle.cos().unsqueeze(-1), angle.sin().unsqueeze(-1)
-    long, short = p * cos + q * sin, q * cos - p * sin
-    long_length, short_length = safe_norm(long), safe_norm(short)
-    u = long / long_length.unsqueeze(-1)
-    normal = torch.linalg.cross(long, short)
-    normal_length = safe_norm(normal).unsqueeze(-1)
-    # A sliver has no normal of its own; any direction across its long axis will do.
-    n = torch.where(normal_length > 1e-20, normal / normal_length, _across(u))
-    return torch.stack([long_length, short_length], -1), torch.stack([u, torch.linalg.cross(n, u), n], -1)
+    long_scale = (0.5 * (xx + yy) + spread + 1e-24).sqrt()
+    scales = torch.stack([long_scale, length / long_scale], -1)
+    # A quarter of atan2: half for the axes' angle, half again for the quaternion.
+    turn = 0.25 * torch.atan2(y, x)
+    c, s = turn.cos(), turn.sin()
+    # The normal's quaternion: (1 + nz, -ny, nx, 0), or from below (-ny, 1 - nz, 0, nx).
+    size = torch.rsqrt(2 * (1 + nz.abs()))
+    w0 = torch.where(upper, 1 + nz, -ny) * size
+    x0 = torch.where(upper, -ny, 1 - nz) * size
+    y0 = torch.where(upper, nx, torch.zeros_like(nx)) * size
+    z0 = torch.where(upper, torch.zeros_like(nx), nx) * size
+    quats = torch.stack([w0 * c - z0 * s, x0 * c + y0 * s, y0 * c - x0 * s, z0 * c + w0 * s], -1)
+    return scales, quats
 
 
 def safe_norm(vectors: Tensor) -> Tensor:
@@ -61,36 +88,11 @@ def safe_norm(vectors: Tensor) -> Tensor:
     return ((vectors * vectors).sum(-1) + 1e-24).sqrt()
 
 
-def _across(u: Tensor) -> Tensor:
-    """Some unit vector perpendicular to unit ``u`` [...,3]."""
-    axis = torch.nn.functional.one_hot(u.abs().argmin(-1), 3).to(u.dtype)
-    return torch.nn.functional.normalize(torch.linalg.cross(u, axis), dim=-1)
-
-
-def matrix_to_quat(rotation: Tensor) -> Tensor:
-    """Rotations [...,3,3] -> unit quaternions [...,4] (wxyz), by the largest of the four components."""
-    m = rotation
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
-    four = torch.stack([trace, m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], -1)
-    diagonal = torch.cat([1 + trace.unsqueeze(-1), 1 + 2 * four[..., 1:] - trace.unsqueeze(-1)], -1)
-    a = m[..., 2, 1] - m[..., 1, 2]
-    b = m[..., 0, 2] - m[..., 2, 0]
-    c = m[..., 1, 0] - m[..., 0, 1]
-    d = m[..., 0, 1] + m[..., 1, 0]
-    e = m[..., 0, 2] + m[..., 2, 0]
-    f = m[..., 1, 2] + m[..., 2, 1]
-    w2, x2, y2, z2 = diagonal.unbind(-1)
-    rows = torch.stack(
-        [
-            torch.stack([w2, a, b, c], -1),
-            torch.stack([a, x2, d, e], -1),
-            torch.stack([b, d, y2, f], -1),
-            torch.stack([c, e, f, z2], -1),
-        ],
-        -2,
-    )
-    best = diagonal.argmax(-1)[..., None, None].expand(*diagonal.shape[:-1], 1, 4)
-    return torch.nn.functional.normalize(torch.gather(rows, -2, best).squeeze(-2), dim=-1)
+def _across(long: Tensor) -> Tensor:
+    """Some unit vector perpendicular to ``long`` [...,3] (any at all where that is zero)."""
+    axis = torch.nn.functional.one_hot(long.abs().argmin(-1), 3).to(long.dtype)
+    across = torch.linalg.cross(long / safe_norm(long).unsqueeze(-1), axis)
+    return torch.where(across.square().sum(-1, keepdim=True) > 0.25, normalize(across, dim=-1), axis)
 
 
 def steiner_inellipse(triangles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -100,8 +102,8 @@ def steiner_inellipse(triangles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     centroid, p, q = conjugate_axes(triangles).unbind(-2)
     # P toward C and Q from A to B: (Q, P) turns counter-clockwise as A, B, C do.
-    semi_axes, rotation = principal_axes(q, p)
-    return centroid, semi_axes, matrix_to_quat(rotation)
+    semi_axes, quats = principal_scales_quats(q, p)
+    return centroid, semi_axes, quats
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:

@@ -23,13 +23,15 @@ class Subdivision:
     _transpose: Tensor | None
 
     def apply(self, vertices: Tensor) -> Tensor:
-        """Vertex positions (or any vertex values) [...,V,C] of the base mesh -> [...,V',C]; differentiable."""
+        """Vertex positions (or other values) [...,V,C] of the base mesh -> [...,V',C]; differentiable."""
         if self._matrix is None or self._transpose is None:
             return vertices
         lead, (count, channels) = vertices.shape[:-2], vertices.shape[-2:]
         # One product for the whole batch: columns are (batch, channel).
         columns = vertices.reshape(-1, count, channels).movedim(1, 0).reshape(count, -1)
-        product: Tensor = _FixedProduct.apply(columns, self._matrix, self._transpose)
+        product: Tensor = _FixedProduct.apply(  # type: ignore[no-untyped-call]
+            columns, self._matrix, self._transpose
+        )
         return product.reshape(self.n_vertices, -1, channels).movedim(0, 1).reshape(*lead, -1, channels)
 
 
@@ -42,7 +44,7 @@ class _FixedProduct(torch.autograd.Function):
         return torch.mm(matrix, dense)
 
     @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[no-untyped-def, override]
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[no-untyped-def]
         return torch.mm(ctx.transpose, gradient), None, None
 
 

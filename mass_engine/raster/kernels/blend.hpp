@@ -37,29 +37,62 @@ MASS_INLINE unsigned start_tile(const TileWindow& w, TileForward& t, float lengt
     return live;
 }
 
-template <bool kExtra>
-MASS_INLINE void accumulate_extra(const Splat& s, const Normal* normal, const Sample& p, M blended, F w, F before,
+template <bool kLowPassOnly>
+MASS_INLINE void accumulate_extra(const Splat& s, const Normal& normal, const Sample& p, M blended, F w, F before,
                                   F depth, F rank, float distortion_scale, TileForwardExtra& e, int block) {
-    if constexpr (kExtra) {
-        const M early = both(blended, lt(splat(kMedianTransmittance), before));
-        store(e.median[block], select(early, depth, load(e.median[block])));
-        store(e.median_rank[block], select(early, rank, load(e.median_rank[block])));
-        store(e.nx[block], fma(w, splat(normal->x), load(e.nx[block])));
-        store(e.ny[block], fma(w, splat(normal->y), load(e.ny[block])));
-        store(e.nz[block], fma(w, splat(normal->z), load(e.nz[block])));
-        // m = a - b / z; the constant a cancels, and so does the shift by the first surfel's b / z.
-        const F q = mul(select(p.solid, p.pz, splat(1.0f)), splat(1.0f / s.zc));
-        const F weight = load(e.weight[block]), m1 = load(e.m1[block]), m2 = load(e.m2[block]);
-        const M first = both(blended, eq(weight, splat(0.0f)));
-        const F q0 = select(first, q, load(e.q0[block]));
-        const F m = keep(blended, mul(splat(distortion_scale), sub(q0, q)));
-        const F pairwise = fma(mul(m, m), weight, fnma(add(m, m), m1, m2));
-        store(e.q0[block], q0);
-        store(e.distortion[block], fma(w, pairwise, load(e.distortion[block])));
-        store(e.weight[block], add(weight, w));
-        store(e.m1[block], fma(w, m, m1));
-        store(e.m2[block], fma(mul(w, m), m, m2));
-    }
+    const M early = both(blended, lt(splat(kMedianTransmittance), before));
+    store(e.median[block], select(early, depth, load(e.median[block])));
+    store(e.median_rank[block], select(early, rank, load(e.median_rank[block])));
+    store(e.nx[block], fma(w, splat(normal.x), load(e.nx[block])));
+    store(e.ny[block], fma(w, splat(normal.y), load(e.ny[block])));
+    store(e.nz[block], fma(w, splat(normal.z), load(e.nz[block])));
+    // m = a - b / z; the constant a cancels, and so does the shift by the first surfel's b / z.
+    const F q = inverse_depth_of<kLowPassOnly>(s, p);
+    const F weight = load(e.weight[block]), m1 = load(e.m1[block]), m2 = load(e.m2[block]);
+    const M first = both(blended, eq(weight, splat(0.0f)));
+    const F q0 = select(first, q, load(e.q0[block]));
+    const F m = keep(blended, mul(splat(distortion_scale), sub(q0, q)));
+    const F pairwise = fma(mul(m, m), weight, fnma(add(m, m), m1, m2));
+    store(e.q0[block], q0);
+    store(e.distortion[block], fma(w, pairwise, load(e.distortion[block])));
+    store(e.weight[block], add(weight, w));
+    store(e.m1[block], fma(w, m, m1));
+    store(e.m2[block], fma(mul(w, m), m, m2));
+}
+
+// One surfel over the blocks in `todo`. Returns the sum of its weights; clears the bits of blocks that end in `live`.
+template <bool kExtra, bool kWeights, bool kLowPassOnly>
+MASS_INLINE F blend_blocks(const CameraData& camera, const Splat& s, const Normal* normal, const TilePixels& pixels, float rank,
+                           unsigned todo, unsigned& live, TileForward& t, TileForwardExtra& e) {
+    const F pz_max = largest_pz(camera, s);
+    F sum_of_weights = splat(0.0f);
+    do {
+        const int block = __builtin_ctz(todo);
+        todo &= todo - 1;
+        const Sample p = sample<kLowPassOnly>(s, load(pixels.x[block % 4]), load(pixels.y[block / 4]), pz_max);
+        const F before = load(t.transmittance[block]);
+        const F after = fnma(before, p.alpha, before);
+        const M blended = both(p.valid, le(splat(kTransmittanceStop), after));
+        const F w = keep(blended, mul(before, p.alpha));
+        const F depth = depth_of<kLowPassOnly>(s, p);
+        store(t.r[block], fma(w, splat(s.r), load(t.r[block])));
+        store(t.g[block], fma(w, splat(s.g), load(t.g[block])));
+        store(t.b[block], fma(w, splat(s.b), load(t.b[block])));
+        store(t.depth[block], fma(w, depth, load(t.depth[block])));
+        F kept = select(blended, after, before);
+        if constexpr (kExtra) {
+            accumulate_extra<kLowPassOnly>(s, *normal, p, blended, w, before, depth, splat(rank), camera.distortion_scale, e, block);
+        }
+        if constexpr (kWeights) sum_of_weights = add(sum_of_weights, w);
+        const M ended = andnot(both(p.valid, lt(splat(0.0f), before)), blended);
+        if (any(ended)) {
+            store(t.stop[block], select(ended, splat(rank), load(t.stop[block])));
+            kept = select(ended, neg(before), kept);
+            if (!any(lt(splat(0.0f), kept))) live &= ~(1u << block);
+        }
+        store(t.transmittance[block], kept);
+    } while (todo != 0);
+    return sum_of_weights;
 }
 
 template <bool kExtra, bool kWeights>
@@ -78,37 +111,19 @@ static void blend_tile(const CameraData& camera, const ProjectedData& in, const 
     tile_pixels(window.x / kTile, window.y / kTile, pixels);
 
     for (uint32_t k = begin; k < end && live != 0; ++k) {
-        __builtin_prefetch(&in.splats[pairs.surfel[k + 8 < end ? k + 8 : k]]);
-        unsigned todo = pairs.blocks[k] & live;
+        const uint32_t ahead = pairs.surfel[k + 8 < end ? k + 8 : k];
+        __builtin_prefetch(&in.splats[ahead]);
+        if constexpr (kExtra) __builtin_prefetch(&in.normals[ahead]);
+        const uint32_t id = pairs.surfel[k];
+        const Splat& s = in.splats[id];
+        const unsigned todo = block_mask(s.box, window) & live;
         if (todo == 0) continue;
-        const Splat& s = in.splats[pairs.surfel[k]];
-        F sum_of_weights = splat(0.0f);
-        do {
-            const int block = __builtin_ctz(todo);
-            todo &= todo - 1;
-            const Sample p = sample(s, load(pixels.x[block % 4]), load(pixels.y[block / 4]));
-            const F before = load(t.transmittance[block]);
-            const F after = fnma(before, p.alpha, before);
-            const M blended = both(p.valid, le(splat(kTransmittanceStop), after));
-            const F w = keep(blended, mul(before, p.alpha));
-            const F depth = mul(splat(s.zc), select(p.solid, p.inverse_pz, splat(1.0f)));
-            store(t.r[block], fma(w, splat(s.r), load(t.r[block])));
-            store(t.g[block], fma(w, splat(s.g), load(t.g[block])));
-            store(t.b[block], fma(w, splat(s.b), load(t.b[block])));
-            store(t.depth[block], fma(w, depth, load(t.depth[block])));
-            F kept = select(blended, after, before);
-            accumulate_extra<kExtra>(s, in.normals + pairs.surfel[k], p, blended, w, before, depth,
-                                     splat(static_cast<float>(k - begin)), camera.distortion_scale, e, block);
-            if constexpr (kWeights) sum_of_weights = add(sum_of_weights, w);
-            const M ended = andnot(both(p.valid, lt(splat(0.0f), before)), blended);
-            if (any(ended)) {
-                store(t.stop[block], select(ended, splat(static_cast<float>(k - begin)), load(t.stop[block])));
-                kept = select(ended, neg(before), kept);
-                if (!any(lt(splat(0.0f), kept))) live &= ~(1u << block);
-            }
-            store(t.transmittance[block], kept);
-        } while (todo != 0);
-        if constexpr (kWeights) slot_weights[pairs.slot[k]] = sum(sum_of_weights);
+        const Normal* normal = kExtra ? in.normals + id : nullptr;
+        const float rank = static_cast<float>(k - begin);
+        const F weights = s.low_pass_only != 0.0f
+                              ? blend_blocks<kExtra, kWeights, true>(camera, s, normal, pixels, rank, todo, live, t, e)
+                              : blend_blocks<kExtra, kWeights, false>(camera, s, normal, pixels, rank, todo, live, t, e);
+        if constexpr (kWeights) slot_weights[slot_of(pairs, id, s.box, window)] = sum(weights);
     }
 
     alignas(64) float alpha[kBlocksPerTile][kLanes];

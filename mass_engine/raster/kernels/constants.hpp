@@ -15,7 +15,6 @@ inline constexpr float kLowPass = 2.0f;
 inline constexpr float kMedianTransmittance = 0.5f;
 // Below this |cosine| between the normal and the viewing ray the disk is edge-on: only its low-pass part is drawn.
 inline constexpr float kEdgeOnCosine = 1e-4f;
-
 // Layout, without influence on the result: a tile is 4 x 4 blocks, a block is 4 x 4 pixels and one vector.
 inline constexpr int kLanes = 16;
 inline constexpr int kBlock = 4;

@@ -59,6 +59,7 @@ public:
         for (std::size_t k = 0; k < 4; ++k) c.K2[k] = camera[12 + k];
         for (std::size_t k = 0; k < 2; ++k) c.k[k] = camera[16 + k];
         c.near_z = camera[18];
+        c.inverse_near = 1.0f / c.near_z;
         c.distortion_scale = camera[19];
         c.width = width;
         c.height = height;
@@ -112,7 +113,6 @@ NB_MODULE(_kernels, m) {
 
     nb::class_<Frame>(m, "Frame", "What one forward pass keeps for its backward pass.")
         .def_prop_ro("dropped", [](Frame& f) { return f.buffers().dropped; })
-        .def_prop_ro("visible", [](Frame& f) { return f.buffers().binning.visible(); })
         .def_prop_ro("pairs", [](Frame& f) { return f.buffers().binning.pair_count(); })
         .def_prop_ro("bytes", [](Frame& f) { return f.buffers().bytes(); });
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "geometry.hpp"
+#include "reduce.hpp"
 
 namespace mass::MASS_ISA {
 
@@ -9,20 +10,26 @@ MASS_INLINE F ceil(F x) { return neg(floor(neg(x))); }
 
 // ln x for positive x, absolute error below 2e-4: for bounds only.
 MASS_INLINE F log_rough(F x) {
-    float in[kLanes], e[kLanes], m[kLanes];
-    store(in, x);
-    for (int l = 0; l < kLanes; ++l) {
-        uint32_t b;
-        __builtin_memcpy(&b, &in[l], 4);
-        e[l] = static_cast<float>(static_cast<int32_t>((b >> 23) & 255u) - 127);
-        b = (b & 0x007fffffu) | 0x3f800000u;
-        __builtin_memcpy(&m[l], &b, 4);
-    }
-    const F f = sub(load(m), splat(1.0f));
+    F exponent, mantissa;
+    split(x, exponent, mantissa);
+    const F f = sub(mantissa, splat(1.0f));
     F p = fma(splat(-0.08428509f), f, splat(0.32363037f));
     p = fma(p, f, splat(-0.67808149f));
     p = fma(p, f, splat(1.43854679f));
-    return mul(splat(0.69314718f), fma(p, f, load(e)));
+    return mul(splat(0.69314718f), fma(p, f, exponent));
+}
+
+// Is rho3 >= rho2 wherever rho2 <= rho_cut? Then it is so wherever the surfel reaches, because {rho3 <= rho_cut} is
+// convex and holds the centre. |(a.d, b.d)| >= (smallest singular value) |d|, pz <= 1 + |g| |d|.
+MASS_INLINE M low_pass_only(const Geometry& g, F reach, M crossing) {
+    const F sum = fma(g.a1, g.a1, fma(g.a2, g.a2, fma(g.b1, g.b1, mul(g.b2, g.b2))));
+    const F det = fnma(g.a2, g.b1, mul(g.a1, g.b2));
+    const F twice = add(det, det);
+    const F root = sqrt(max(fnma(twice, twice, mul(sum, sum)), splat(0.0f)));
+    const F smallest2 = div(mul(twice, det), add(sum, root));  // det^2 / (larger eigenvalue)
+    const F pz = fma(sqrt(fma(g.g1, g.g1, mul(g.g2, g.g2))), reach, splat(1.0f));
+    const M narrow = lt(mul(splat(1.001f * kLowPass), mul(pz, pz)), smallest2);
+    return either(andnot(narrow, crossing), g.edge_on);
 }
 
 int project(const CameraData& camera, const SurfelData& in, const ProjectedData& out, int begin, int end) {
@@ -33,6 +40,7 @@ int project(const CameraData& camera, const SurfelData& in, const ProjectedData&
         const int lanes = end - first < kLanes ? end - first : kLanes;
         int ids[kLanes];
         for (int l = 0; l < kLanes; ++l) ids[l] = first + (l < lanes ? l : 0);
+        if (first + 9 * kLanes <= in.count) prefetch_run(in, first + 8 * kLanes);
         const SurfelLanes s = lanes == kLanes ? load_run(in, first) : load_lanes(in, ids);
         const Geometry g = make_geometry(camera, s);
         const F zc = g.c[2];
@@ -78,42 +86,33 @@ int project(const CameraData& camera, const SurfelData& in, const ProjectedData&
         dropped += __builtin_popcount(bad);
         const unsigned visible = bits(seen) & exists;
 
-        alignas(64) float record[kLanes][kLanes], normal[3][kLanes], bounds[4][kLanes], depth[kLanes];
-        store(record[0], g.mx);
-        store(record[1], g.my);
-        store(record[2], select(g.edge_on, zero, g.a1));
-        store(record[3], select(g.edge_on, zero, g.a2));
-        store(record[4], select(g.edge_on, zero, g.b1));
-        store(record[5], select(g.edge_on, zero, g.b2));
-        store(record[6], select(g.edge_on, zero, g.g1));
-        store(record[7], select(g.edge_on, zero, g.g2));
-        store(record[8], zc);
-        store(record[9], s.opacity);
-        store(record[10], rho_cut);
-        store(record[11], select(g.edge_on, splat(-1.0f), div(zc, near_z)));
-        for (int k = 0; k < 3; ++k) store(record[12 + k], s.color[k]);
-        store(record[15], zero);
+        alignas(64) float bounds[4][kLanes], depth[kLanes], normal[3][kLanes];
+        alignas(64) Box box[kLanes];
+        alignas(64) float box_low[kLanes], box_high[kLanes];
         store(depth, zc);
         store(bounds[0], x0);
         store(bounds[1], x1);
         store(bounds[2], y0);
         store(bounds[3], y1);
+        for (int l = 0; l < kLanes; ++l) {
+            const bool shown = visible >> l & 1u;
+            box[l] = {static_cast<int16_t>(shown ? bounds[0][l] : 0), static_cast<int16_t>(shown ? bounds[1][l] : -1),
+                      static_cast<int16_t>(shown ? bounds[2][l] : 0), static_cast<int16_t>(shown ? bounds[3][l] : -1)};
+            __builtin_memcpy(&box_low[l], &box[l].x0, 4);
+            __builtin_memcpy(&box_high[l], &box[l].y0, 4);
+        }
+        __builtin_memcpy(out.boxes + first, box, sizeof(Box) * static_cast<size_t>(lanes));
+        __builtin_memcpy(out.keys + first, depth, sizeof(float) * static_cast<size_t>(lanes));
+        if (visible == 0) continue;
+
+        F rows[kLanes] = {g.mx, g.my, g.a1, g.a2, g.b1, g.b2, g.g1, g.g2, zc, s.opacity, s.color[0], s.color[1], s.color[2],
+                          keep(low_pass_only(g, reach, crossing), splat(1.0f)), load(box_low), load(box_high)};
+        transpose16(rows);
+        for (int l = 0; l < lanes; ++l) store(&out.splats[first + l].mx, rows[l]);
         if (out.normals) {
             const F sign = select(lt(zero, g.facing), splat(-1.0f), splat(1.0f));
             for (int k = 0; k < 3; ++k) store(normal[k], mul(sign, g.n[k]));
-        }
-        for (int l = 0; l < lanes; ++l) {
-            const int i = first + l;
-            if (!(visible >> l & 1u)) {
-                out.keys[i] = kCulled;
-                continue;
-            }
-            __builtin_memcpy(&out.keys[i], &depth[l], 4);
-            float* to = &out.splats[i].mx;
-            for (int k = 0; k < kLanes; ++k) to[k] = record[k][l];
-            out.boxes[i] = {static_cast<int16_t>(bounds[0][l]), static_cast<int16_t>(bounds[1][l]),
-                            static_cast<int16_t>(bounds[2][l]), static_cast<int16_t>(bounds[3][l])};
-            if (out.normals) out.normals[i] = {normal[0][l], normal[1][l], normal[2][l], 0.0f};
+            for (int l = 0; l < lanes; ++l) out.normals[first + l] = {normal[0][l], normal[1][l], normal[2][l], 0.0f};
         }
     }
     return dropped;

@@ -9,8 +9,7 @@ namespace mass::MASS_ISA {
 struct PixelSums {
     F color[3], opacity;
     F a1, a2, b1, b2, g1, g2, zc;
-    F low_x, low_y, pu, pv, pz;
-    F normal[3];
+    F mx, my, normal[3];
 };
 
 // Adds a surfel's pairs in slot order.
@@ -19,16 +18,11 @@ MASS_INLINE bool collect(const PairSums& in, uint32_t begin, uint32_t end, float
     for (uint32_t slot = begin; slot < end; ++slot) {
         if (!in.touched[slot]) continue;
         if (!found) {
-            for (int k = 0; k < 19; ++k) total[k] = 0.0f;
+            for (int k = 0; k < 16; ++k) total[k] = 0.0f;
             found = true;
         }
         const float* g = &in.gradient[slot].r;
         for (int k = 0; k < 16; ++k) total[k] += g[k];
-        if (in.normal) {
-            total[16] += in.normal[slot].x;
-            total[17] += in.normal[slot].y;
-            total[18] += in.normal[slot].z;
-        }
     }
     return found;
 }
@@ -55,11 +49,6 @@ MASS_INLINE void differentiate(const CameraData& camera, const SurfelLanes& s, c
     const M solid = andnot(all, g.edge_on);
     const F zc = g.c[2], inverse_z = div(splat(1.0f), zc);
 
-    // Pixel centre: every pixel offset d = pixel - centre, and the low-pass part.
-    const F low = splat(-2.0f * kLowPass);
-    const F d_mx = fma(low, p.low_x, neg(keep(solid, fma(g.a1, p.pu, fma(g.b1, p.pv, mul(g.g1, p.pz))))));
-    const F d_my = fma(low, p.low_y, neg(keep(solid, fma(g.a2, p.pu, fma(g.b2, p.pv, mul(g.g2, p.pz))))));
-
     // a = zc G0 / su, b = zc G1 / sv, g = -(z0 G0 + z1 G1)
     const F iu = div(splat(1.0f), s.scale[0]), iv = div(splat(1.0f), s.scale[1]);
     const F ku = mul(zc, iu), kv = mul(zc, iv);
@@ -82,12 +71,12 @@ MASS_INLINE void differentiate(const CameraData& camera, const SurfelLanes& s, c
     const F k00 = splat(camera.K2[0]), k01 = splat(camera.K2[1]), k10 = splat(camera.K2[2]), k11 = splat(camera.K2[3]);
     const F dn00 = fma(k00, dJ00, mul(k10, dJ10)), dn01 = fma(k00, dJ01, mul(k10, dJ11));
     const F dn10 = fma(k01, dJ00, mul(k11, dJ10)), dn11 = fma(k01, dJ01, mul(k11, dJ11));
-    F d_nx = fma(k00, d_mx, mul(k10, d_my)), d_ny = fma(k01, d_mx, mul(k11, d_my));
-    const F dK[4] = {fma(dJ00, g.jn00, fma(dJ01, g.jn01, mul(d_mx, g.nx))), fma(dJ00, g.jn10, fma(dJ01, g.jn11, mul(d_mx, g.ny))),
-                     fma(dJ10, g.jn00, fma(dJ11, g.jn01, mul(d_my, g.nx))), fma(dJ10, g.jn10, fma(dJ11, g.jn11, mul(d_my, g.ny)))};
+    F d_nx = fma(k00, p.mx, mul(k10, p.my)), d_ny = fma(k01, p.mx, mul(k11, p.my));
+    const F dK[4] = {fma(dJ00, g.jn00, fma(dJ01, g.jn01, mul(p.mx, g.nx))), fma(dJ00, g.jn10, fma(dJ01, g.jn11, mul(p.mx, g.ny))),
+                     fma(dJ10, g.jn00, fma(dJ11, g.jn01, mul(p.my, g.nx))), fma(dJ10, g.jn10, fma(dJ11, g.jn11, mul(p.my, g.ny)))};
     for (int k = 0; k < 4; ++k) sums.K2[k] = add(sums.K2[k], keep(exists, dK[k]));
-    sums.k[0] = add(sums.k[0], keep(exists, d_mx));
-    sums.k[1] = add(sums.k[1], keep(exists, d_my));
+    sums.k[0] = add(sums.k[0], keep(exists, p.mx));
+    sums.k[1] = add(sums.k[1], keep(exists, p.my));
 
     // Jn column i = (x_i - nx z_i, y_i - ny z_i)
     du[0] = dn00;
@@ -150,8 +139,8 @@ MASS_INLINE void scatter(const LaneGradient& g, const int* ids, int count, const
     }
 }
 
-void project_backward(const CameraData& camera, const SurfelData& in, const uint32_t* slot_begin, const uint32_t* slot_end,
-                      const PairSums& sums, const SurfelGradient& out, float* camera_gradient, int begin, int end) {
+void project_backward(const CameraData& camera, const SurfelData& in, const uint32_t* slot_begin, const PairSums& sums,
+                      const SurfelGradient& out, float* camera_gradient, int begin, int end) {
     const int64_t first = begin, count = end - begin;
     __builtin_memset(out.means + 3 * first, 0, sizeof(float) * 3 * static_cast<size_t>(count));
     __builtin_memset(out.quats + 4 * first, 0, sizeof(float) * 4 * static_cast<size_t>(count));
@@ -166,13 +155,13 @@ void project_backward(const CameraData& camera, const SurfelData& in, const uint
     for (F& x : camera_sums.k) x = splat(0.0f);
 
     int ids[kLanes], lanes = 0;
-    alignas(64) float total[19], pixel[19][kLanes];
+    alignas(64) float total[16], pixel[16][kLanes];
     alignas(64) float exists[kLanes];
     for (int i = begin; i <= end; ++i) {
         if (i < end) {
-            if (slot_begin[i] == slot_end[i] || !collect(sums, slot_begin[i], slot_end[i], total)) continue;
+            if (!collect(sums, slot_begin[i], slot_begin[i + 1], total)) continue;
             ids[lanes] = i;
-            for (int k = 0; k < 19; ++k) pixel[k][lanes] = total[k];
+            for (int k = 0; k < 16; ++k) pixel[k][lanes] = total[k];
             ++lanes;
         }
         if (lanes < kLanes && (i < end || lanes == 0)) continue;
@@ -180,7 +169,7 @@ void project_backward(const CameraData& camera, const SurfelData& in, const uint
             exists[l] = l < lanes ? 1.0f : 0.0f;
             if (l >= lanes) {
                 ids[l] = ids[0];
-                for (int k = 0; k < 19; ++k) pixel[k][l] = 0.0f;
+                for (int k = 0; k < 16; ++k) pixel[k][l] = 0.0f;
             }
         }
         PixelSums p;
@@ -193,12 +182,9 @@ void project_backward(const CameraData& camera, const SurfelData& in, const uint
         p.g1 = load(pixel[8]);
         p.g2 = load(pixel[9]);
         p.zc = load(pixel[10]);
-        p.low_x = load(pixel[11]);
-        p.low_y = load(pixel[12]);
-        p.pu = load(pixel[13]);
-        p.pv = load(pixel[14]);
-        p.pz = load(pixel[15]);
-        for (int k = 0; k < 3; ++k) p.normal[k] = load(pixel[16 + k]);
+        p.mx = load(pixel[11]);
+        p.my = load(pixel[12]);
+        for (int k = 0; k < 3; ++k) p.normal[k] = load(pixel[13 + k]);
         const SurfelLanes s = load_lanes(in, ids);
         LaneGradient lane_gradient;
         differentiate(camera, s, make_geometry(camera, s), p, lt(splat(0.0f), load(exists)), camera_sums, lane_gradient);

@@ -1,4 +1,4 @@
-// Sums across lanes.
+// Sums across lanes, and transposition.
 #pragma once
 
 #include "simd.hpp"
@@ -23,6 +23,31 @@ MASS_INLINE void sum16(const F* x, float* out) {
         c[i] = add(_mm512_shuffle_f32x4(b[2 * i], b[2 * i + 1], 0x88), _mm512_shuffle_f32x4(b[2 * i], b[2 * i + 1], 0xdd));
     }
     store(out, add(_mm512_shuffle_f32x4(c[0], c[1], 0x88), _mm512_shuffle_f32x4(c[0], c[1], 0xdd)));
+}
+
+// Row r, lane c <-> row c, lane r.
+MASS_INLINE void transpose16(F* x) {
+    F a[16], b[16];
+    for (int i = 0; i < 8; ++i) {
+        a[2 * i] = _mm512_unpacklo_ps(x[2 * i], x[2 * i + 1]);
+        a[2 * i + 1] = _mm512_unpackhi_ps(x[2 * i], x[2 * i + 1]);
+    }
+    // b[4 i + j], 128-bit lane k: column 4 k + j of rows 4 i .. 4 i + 3
+    for (int i = 0; i < 4; ++i) {
+        for (int h = 0; h < 2; ++h) {
+            const __m512d p = _mm512_castps_pd(a[4 * i + h]), q = _mm512_castps_pd(a[4 * i + 2 + h]);
+            b[4 * i + 2 * h] = _mm512_castpd_ps(_mm512_unpacklo_pd(p, q));
+            b[4 * i + 2 * h + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(p, q));
+        }
+    }
+    for (int j = 0; j < 4; ++j) {
+        const F even_low = _mm512_shuffle_f32x4(b[j], b[4 + j], 0x88), odd_low = _mm512_shuffle_f32x4(b[j], b[4 + j], 0xdd);
+        const F even_high = _mm512_shuffle_f32x4(b[8 + j], b[12 + j], 0x88), odd_high = _mm512_shuffle_f32x4(b[8 + j], b[12 + j], 0xdd);
+        x[j] = _mm512_shuffle_f32x4(even_low, even_high, 0x88);
+        x[8 + j] = _mm512_shuffle_f32x4(even_low, even_high, 0xdd);
+        x[4 + j] = _mm512_shuffle_f32x4(odd_low, odd_high, 0x88);
+        x[12 + j] = _mm512_shuffle_f32x4(odd_low, odd_high, 0xdd);
+    }
 }
 
 #elif MASS_WIDTH == 8
@@ -59,6 +84,18 @@ MASS_INLINE void sum16(const F* x, float* out) {
     for (int i = 0; i < 16; ++i) out[i] = sum(x[i]);
 }
 
+#endif
+
+#if MASS_WIDTH != 16
+// Row r, lane c <-> row c, lane r.
+MASS_INLINE void transpose16(F* x) {
+    float a[16][kLanes], b[16][kLanes];
+    __builtin_memcpy(a, x, sizeof a);
+    for (int r = 0; r < 16; ++r) {
+        for (int c = 0; c < 16; ++c) b[c][r] = a[r][c];
+    }
+    __builtin_memcpy(x, b, sizeof b);
+}
 #endif
 
 }  // namespace mass::MASS_ISA

@@ -45,7 +45,7 @@ PixelState FrameBuffers::state() const {
 std::size_t FrameBuffers::bytes() const {
     return splats.bytes() + normals.bytes() + boxes.bytes() + keys.bytes() + binning.bytes() + slot_weights.bytes() +
            transmittance.bytes() + stop.bytes() + median_rank.bytes() + moments.bytes() + pair_gradient.bytes() +
-           pair_normal.bytes() + touched.bytes() + camera_partial.bytes();
+           touched.bytes() + camera_partial.bytes();
 }
 
 Renderer::Renderer(const std::string& instruction_set) : table_(nullptr) {
@@ -108,8 +108,7 @@ std::unique_ptr<FrameBuffers> Renderer::forward(const CameraData& camera, const 
     frame->dropped = dropped;
 
     Binning& binning = frame->binning;
-    binning.sort(projected.keys, count, pool_, threads);
-    binning.assign(camera, projected.boxes, count, differentiable || weights != nullptr, pool_, threads);
+    binning.assign(camera, projected.boxes, projected.keys, count, differentiable || weights != nullptr, pool_, threads);
     const PairData pairs = binning.pairs();
 
     float* slot_weights = nullptr;
@@ -119,14 +118,17 @@ std::unique_ptr<FrameBuffers> Renderer::forward(const CameraData& camera, const 
     }
     const PixelState state = frame->state();
     pool_.loop(camera.tiles_x * camera.tiles_y, threads,
-               [&](int tile) { table_->blend(camera, projected, pairs, images, state, slot_weights, tile); });
+               [&](int tile) {
+                   binning.sort(tile);
+                   table_->blend(camera, projected, pairs, images, state, slot_weights, tile);
+               });
 
     if (weights) {
         pool_.loop(chunks(count), threads, [&](int chunk) {
             const int begin = chunk * kChunk, end = count - begin < kChunk ? count : begin + kChunk;
             for (int i = begin; i < end; ++i) {
                 float sum = 0.0f;
-                for (uint32_t slot = binning.slot_begin()[i]; slot < binning.slot_end()[i]; ++slot) sum += slot_weights[slot];
+                for (uint32_t slot = binning.slot_begin()[i]; slot < binning.slot_begin()[i + 1]; ++slot) sum += slot_weights[slot];
                 weights[i] = sum;
             }
         });
@@ -145,7 +147,7 @@ void Renderer::backward(FrameBuffers& frame, const SurfelData& surfels, const Im
 
     PairSums sums{};
     sums.gradient = frame.pair_gradient.reserve(pair_count);
-    sums.normal = extra ? frame.pair_normal.reserve(pair_count) : nullptr;
+    sums.extra = extra;
     sums.touched = frame.touched.reserve(pair_count + 1);
     std::memset(sums.touched, 0, pair_count);
     pool_.loop(camera.tiles_x * camera.tiles_y, threads, [&](int tile) {
@@ -156,7 +158,7 @@ void Renderer::backward(FrameBuffers& frame, const SurfelData& surfels, const Im
     float* partial = frame.camera_partial.reserve(size(n) * kCameraGradient + 1);
     pool_.loop(n, threads, [&](int chunk) {
         const int begin = chunk * kChunk, end = frame.count - begin < kChunk ? frame.count : begin + kChunk;
-        table_->project_backward(camera, surfels, frame.binning.slot_begin(), frame.binning.slot_end(), sums, out,
+        table_->project_backward(camera, surfels, frame.binning.slot_begin(), sums, out,
                                  partial + size(chunk) * kCameraGradient, begin, end);
     });
     for (int k = 0; k < kCameraGradient; ++k) {

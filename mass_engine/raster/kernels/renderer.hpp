@@ -23,7 +23,6 @@ struct FrameBuffers {
     Buffer<float> slot_weights;
     Buffer<float> transmittance, stop, median_rank, moments;
     Buffer<PairGradient> pair_gradient;
-    Buffer<Normal> pair_normal;
     Buffer<uint8_t> touched;
     Buffer<float> camera_partial;
 

@@ -47,6 +47,7 @@ MASS_INLINE M le(F a, F b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
 MASS_INLINE M lt(F a, F b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
 MASS_INLINE M eq(F a, F b) { return _mm512_cmp_ps_mask(a, b, _CMP_EQ_OQ); }
 MASS_INLINE M both(M a, M b) { return a & b; }
+MASS_INLINE M either(M a, M b) { return a | b; }
 MASS_INLINE M andnot(M a, M b) { return static_cast<M>(a & ~b); }  // a and not b
 MASS_INLINE F select(M m, F a, F b) { return _mm512_mask_blend_ps(m, b, a); }
 MASS_INLINE F keep(M m, F a) { return _mm512_maskz_mov_ps(m, a); }
@@ -58,8 +59,11 @@ MASS_INLINE F gather(const float* p, int stride) {
     return _mm512_i32gather_ps(_mm512_mullo_epi32(lane, _mm512_set1_epi32(stride)), p, 4);
 }
 
-// 2^x for x <= 0; flushes to zero below 2^-126.
-MASS_INLINE F exp2_neg(F x);
+// x = mantissa * 2^exponent with mantissa in [1, 2), for positive normal x.
+MASS_INLINE void split(F x, F& exponent, F& mantissa) {
+    exponent = _mm512_getexp_ps(x);
+    mantissa = _mm512_getmant_ps(x, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_zero);
+}
 
 #else
 
@@ -187,6 +191,11 @@ MASS_INLINE M both(M a, M b) {
     MASS_PARTS r.v[i] = a.v[i] & b.v[i];
     return r;
 }
+MASS_INLINE M either(M a, M b) {
+    M r;
+    MASS_PARTS r.v[i] = a.v[i] | b.v[i];
+    return r;
+}
 MASS_INLINE M andnot(M a, M b) {
     M r;
     MASS_PARTS r.v[i] = a.v[i] & ~b.v[i];
@@ -226,6 +235,20 @@ MASS_INLINE F gather(const float* p, int stride) {
     float x[kLanes];
     for (int l = 0; l < kLanes; ++l) x[l] = p[l * stride];
     return load(x);
+}
+// x = mantissa * 2^exponent with mantissa in [1, 2), for positive normal x.
+MASS_INLINE void split(F x, F& exponent, F& mantissa) {
+    float in[kLanes], e[kLanes], m[kLanes];
+    store(in, x);
+    for (int l = 0; l < kLanes; ++l) {
+        uint32_t b;
+        __builtin_memcpy(&b, &in[l], 4);
+        e[l] = static_cast<float>(static_cast<int32_t>((b >> 23) & 255u) - 127);
+        b = (b & 0x007fffffu) | 0x3f800000u;
+        __builtin_memcpy(&m[l], &b, 4);
+    }
+    exponent = load(e);
+    mantissa = load(m);
 }
 
 #endif  // MASS_WIDTH == 16

@@ -13,7 +13,7 @@ struct CameraData {
     float t[3];   // world_to_camera translation
     float K2[4];  // upper left 2 x 2 of K
     float k[2];   // principal point, pixels
-    float near_z;
+    float near_z, inverse_near;
     int width, height;
     int tiles_x, tiles_y;
     bool cull_backfaces;
@@ -25,42 +25,40 @@ struct SurfelData {
     int count;
 };
 
+// Inclusive pixel bounds inside the image; x1 < x0 when the surfel is not seen.
+struct Box {
+    int16_t x0, x1, y0, y1;
+};
+
 // One projected surfel: what a pixel needs to know, one cache line.
 // With d = pixel - (mx, my): pz = 1 + g.d, (u, v) = (a.d, b.d) / pz, depth = zc / pz.
 struct alignas(64) Splat {
     float mx, my;
     float a1, a2, b1, b2, g1, g2;
     float zc, opacity;
-    float rho_cut;  // no pixel with a larger rho passes kAlphaCut (slightly generous)
-    float pz_max;   // zc / near: a larger pz lies before the near plane; negative: no 3-D part at all
     float r, g, b;
-    float unused;
+    float low_pass_only;  // 1: rho2 < rho3 wherever the surfel reaches (sub-pixel or edge-on), a, b and g do not matter
+    Box box;
 };
 
 struct Normal {
     float x, y, z, unused;
 };
 
-// Inclusive pixel bounds inside the image.
-struct Box {
-    int16_t x0, x1, y0, y1;
-};
-
-inline constexpr uint32_t kCulled = 0xffffffffu;
-
 struct ProjectedData {
     Splat* splats;
     Normal* normals;  // null when not wanted
     Box* boxes;
-    uint32_t* keys;  // bits of the centre depth (positive, so they sort as integers), or kCulled
+    uint32_t* keys;  // bits of the centre depth: positive, so they sort as integers
 };
 
 // The (surfel, tile) pairs, grouped by tile, nearest first.
 struct PairData {
     const uint32_t* tile_begin;  // [tiles + 1]
     const uint32_t* surfel;
-    const uint16_t* blocks;  // which of the tile's 16 blocks the bounds touch
-    const uint32_t* slot;    // where the pair's per-surfel sums go; null when none are wanted
+    // First of a surfel's slots, [count + 1]: pair sums are kept surfel by surfel, then tile by tile in row order.
+    // Null when no sums are wanted.
+    const uint32_t* slot_begin;
 };
 
 struct ImageData {  // outputs; extras are null unless wanted
@@ -85,8 +83,8 @@ struct ImageGradient {  // null means zero
 struct alignas(64) PairGradient {
     float r, g, b, opacity;
     float a1, a2, b1, b2;
-    float g1, g2, zc, low_x;
-    float low_y, pu, pv, pz;
+    float g1, g2, zc, mx;
+    float my, nx, ny, nz;
 };
 
 struct SurfelGradient {
@@ -98,7 +96,7 @@ inline constexpr int kCameraGradient = 18;
 
 struct PairSums {
     PairGradient* gradient;
-    Normal* normal;    // gradient of the normal; null unless a normal gradient came in
+    bool extra;        // a gradient of an extra output came in
     uint8_t* touched;  // the slot holds a value
 };
 
@@ -111,9 +109,8 @@ struct KernelTable {
                   float* slot_weights, int tile);
     void (*blend_backward)(const CameraData&, const ProjectedData&, const PairData&, const ImageData&,
                            const PixelState&, const ImageGradient&, const PairSums&, int tile);
-    void (*project_backward)(const CameraData&, const SurfelData&, const uint32_t* slot_begin,
-                             const uint32_t* slot_end, const PairSums&, const SurfelGradient&,
-                             float* camera_gradient, int begin, int end);
+    void (*project_backward)(const CameraData&, const SurfelData&, const uint32_t* slot_begin, const PairSums&,
+                             const SurfelGradient&, float* camera_gradient, int begin, int end);
 };
 
 }  // namespace mass

@@ -80,7 +80,7 @@ def main() -> None:
             )
         for levels, depth in _MODELS:
             binding = MeshBinding.build(model, levels, depth)
-            for sigma in (0.5, 0.6, 0.7, 0.85, 1.0):
+            for sigma in (0.5, 0.7, 0.85, 1.0, 1.25):
                 shares = [
                     coverage(binding.surfels(vertices), sigma / SIGMA_PER_SEMI_AXIS, vertices, 20)
                     for vertices in posed.values()

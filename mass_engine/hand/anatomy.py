@@ -191,17 +191,17 @@ def soft_tissue(betas: Vector) -> list[Tissue]:
     # The balls of the thumb and of the little finger, and the skin between thumb and index.
     thumb = digit_line(points, "thumb")
     parts.append(
-        lump("palm", (at(-20, -9, 12), 0.35 * thumb[0] + 0.65 * thumb[1] + at(0, -2, -4)), (13.0, 7.5), 0.014)
+        lump("palm", (at(-20, -9, 12), 0.42 * thumb[0] + 0.58 * thumb[1] + at(0, -1, -4)), (13.0, 7.0), 0.014)
     )
     parts.append(lump("palm", (at(-12, -8, -19), at(-58, -9, -32)), (14.0, 10.5), 0.014))
     pad = np.array([-0.004, -0.0060, 0.0]) * size
     parts.append(lump("palm", (points[1] + pad, points[10] + pad), (8.0, 7.0), 0.016))
-    parts.append(lump("palm", (points[10] + pad, points[7] + pad * 0.9), (6.5, 6.0), 0.016))
-    web = (0.3 * thumb[0] + 0.7 * thumb[1], 0.45 * points[1] + np.array([0.0, -0.006, 0.0]) * size)
+    parts.append(lump("palm", (points[10] + pad, points[7] + pad * 0.9), (6.5, 5.2), 0.014))
+    web = (0.4 * thumb[0] + 0.6 * thumb[1], 0.45 * points[1] + np.array([0.0, -0.004, 0.0]) * size)
     parts.append(lump("palm", web, (7.0, 8.0), 0.020))
     web = (0.25 * thumb[0] + 0.75 * thumb[1], 0.72 * points[1] + np.array([0.0, -0.005, 0.0]) * size)
     parts.append(lump("palm", web, (4.0, 7.5), 0.020))
-    half = np.array([[28.0, 16.5, 20.5], [27.0, 15.0, 20.0], [27.5, 12.5, 19.0]]) * wrist * 1e-3
+    half = np.array([[27.5, 16.0, 21.0], [26.5, 14.5, 20.5], [27.0, 12.0, 19.5]]) * wrist * 1e-3
     line = np.array([[0.060, -0.002, -0.002], [0.012, -0.001, -0.002], [-0.012, -0.001, -0.001]]) * size
     parts.append(Tissue("wrist", line, half, up, 0.012 * size, 0.022 * size))
     return parts

@@ -16,7 +16,7 @@ from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.densify import SURFELS_PER_FACE, fractal_corners
 from mass_engine.surfel.inellipse import SIGMA_PER_SEMI_AXIS, quat_to_matrix, steiner_inellipse
 
-few = settings(max_examples=10, deadline=None, derandomize=True)
+few = settings(max_examples=5, deadline=None, derandomize=True)
 
 
 def test_the_papers_counts() -> None:

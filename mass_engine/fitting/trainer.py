@@ -49,7 +49,7 @@ def schedule_for(preset: str) -> Schedule:
     """The schedule of a preset (draft, auto, full)."""
     rough = GeometryWeights(landmarks=1.0, outline=20.0, limits=1.0)
     middle = GeometryWeights(landmarks=0.1, outline=20.0)
-    fine = GeometryWeights(landmarks=0.05, outline=5.0)
+    fine = GeometryWeights(landmarks=0.05, outline=10.0)
     first = GeometryPass(96, 10, rate=2.0, color=False, weights=rough)
     heldout = (
         replace(first, visits=8, levels=1, depth=0, rate=1.0, shared=False, weights=middle),
@@ -63,8 +63,8 @@ def schedule_for(preset: str) -> Schedule:
         return Schedule(1, 0, 0, geometry, (AppearancePass(256, 2),), heldout, 40, 256)
     geometry = (
         first,
-        GeometryPass(160, 10, levels=1, depth=0, rate=1.5, weights=middle),
-        GeometryPass(320, 10, levels=1, depth=1, rate=0.6, weights=fine),
+        GeometryPass(160, 14, levels=1, depth=0, rate=1.5, weights=middle),
+        GeometryPass(320, 16, levels=1, depth=1, rate=0.8, weights=fine),
     )
     appearance = (AppearancePass(320, 2), AppearancePass(640, 3, rate=0.7, view_dependent=True))
     if preset == "auto":
@@ -209,7 +209,7 @@ def _keep(evidence: Evidence, binding: MeshBinding, model: HandModel) -> Tensor:
     along = along if model.side == "right" else -along
     wrist = along > along.max() - WRIST_REACH
     order = along[wrist].argsort()
-    gain = (0.4 * (evidence.ignored + evidence.background) - evidence.hand)[wrist][order]
+    gain = (0.15 * (evidence.ignored + evidence.background) - evidence.hand)[wrist][order]
     # Cutting before rank k gains what lies beyond it.
     beyond = torch.cat([gain.flip(0).cumsum(0).flip(0), torch.zeros(1)])
     rank = int(beyond.argmax())

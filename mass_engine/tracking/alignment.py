@@ -37,6 +37,7 @@ class AlignmentWeights:
 
     reprojection: float = 1.0
     direction: float = 0.02  # world landmarks: bone directions
+    direction_lead: float = 0.5  # more of it at the start, gone by half time
     limits: float = 1.0
     rest: float = 2e-4  # pull of every finger angle towards the flat hand
     shape: float = 2e-4  # pull of every shape parameter towards the mean hand
@@ -159,7 +160,10 @@ def align_landmarks(
         robust = w.robust_scale * ((1 + (pixel_error / w.robust_scale) ** 2).sqrt() - 1)
         direction = torch.nn.functional.normalize(joints[:, children] - joints[:, parents], dim=-1)
         cue = 1 - (direction * seen_direction).sum(-1)
-        loss = w.reprojection * (robust.mean(-1) * trust).mean() + w.direction * (cue.mean(-1) * trust).mean()
+        # The image alone cannot tell a finger bent forward from one bent back: the cue decides that first.
+        lead = max(0.0, 1 - 2 * iteration / iterations)
+        loss = w.reprojection * (robust.mean(-1) * trust).mean()
+        loss = loss + (w.direction + w.direction_lead * lead) * (cue.mean(-1) * trust).mean()
         loss = loss + w.limits * limit_excess(fingers, limits, frames).square().sum((-1, -2)).mean()
         loss = loss + w.rest * fingers.square().sum(-1).mean() + w.shape * free_betas.square().sum()
         behind = (0.05 - joints[..., 2]).clamp_min(0)

@@ -121,7 +121,7 @@ void ThreadPool::loop(int count, int threads, const std::function<void(int)>& bo
     }
     s.take_part();
     while (s.finished.load(std::memory_order_acquire) != static_cast<uint32_t>(count)) {
-        for (int i = 0; i < 20000 && s.finished.load(std::memory_order_acquire) != static_cast<uint32_t>(count); ++i) State::pause();
+        for (int i = 0; i < 200 && s.finished.load(std::memory_order_acquire) != static_cast<uint32_t>(count); ++i) State::pause();
         if (s.finished.load(std::memory_order_acquire) != static_cast<uint32_t>(count)) std::this_thread::yield();
     }
 }

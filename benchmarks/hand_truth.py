@@ -102,7 +102,7 @@ class Fit:
             optimizer.zero_grad()
             loss = loss_of(step)
             excess = limit_excess(self.fingers, self.limits, self.frames).square().sum((-1, -2)).mean()
-            (loss + 2e-5 * excess + 2e-8 * self.betas.square().sum()).backward()  # type: ignore[no-untyped-call]
+            (loss + 2e-5 * excess + 2e-8 * self.betas.square().sum()).backward()
             optimizer.step()
         for leaf in leaves:
             leaf.requires_grad_(False)

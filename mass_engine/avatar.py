@@ -54,7 +54,8 @@ class SourceFrames:
             raise BadArgumentError(
                 "pose.no_such_frame",
                 f"Frame {index} has no fitted hand.",
-                f"Use a frame from {int(self.indices.min())} to {int(self.indices.max())} in which the hand was tracked.",
+                "Use a frame in which the hand was tracked, "
+                f"from {int(self.indices.min())} to {int(self.indices.max())}.",
             )
         return row_pose(self.pose, int(rows[0]))
 
@@ -160,7 +161,9 @@ class Avatar:
         pose = self.resolve_pose(pose_spec)
         if pose_spec.strip() == "rest":
             rest = HandPose.rest(self.shape.model.side)
-            pose = HandPose(pose.betas, rest.global_orient[None], rest.hand_pose[None], rest.transl[None], rest.side)
+            pose = HandPose(
+                pose.betas, rest.global_orient[None], rest.hand_pose[None], rest.transl[None], rest.side
+            )
         surfels = self.posed(pose)
         plain = Appearance(
             self.appearance.albedo,
@@ -215,7 +218,9 @@ class Avatar:
             "size": json.dumps([self.camera.width, self.camera.height]),
         }
         partial = target.with_name(target.name + ".partial")
-        save_file({name: value.detach().contiguous().clone() for name, value in tensors.items()}, partial, metadata)
+        save_file(
+            {name: value.detach().contiguous().clone() for name, value in tensors.items()}, partial, metadata
+        )
         os.replace(partial, target)
 
     @staticmethod
@@ -280,4 +285,3 @@ def straight_rgba(out: RenderOutput) -> NDArray[np.uint8]:
     color = torch.where(alpha.unsqueeze(-1) > 1e-4, out.rgb / alpha.clamp_min(1e-4).unsqueeze(-1), 0.0)
     picture = torch.cat([color.clamp(0, 1), alpha.unsqueeze(-1)], -1)
     return cast("NDArray[np.uint8]", (picture * 255).round().to(torch.uint8).numpy())
-

@@ -1,4 +1,7 @@
-"""The command line. Exit codes: 0 done, 2 bad arguments, 3 unusable input, 4 internal failure, 130 interrupted."""
+"""The command line.
+
+Exit codes: 0 done, 2 bad arguments, 3 unusable input, 4 internal failure, 130 interrupted.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +34,14 @@ def build_parser() -> argparse.ArgumentParser:
     fit.add_argument("--out", type=Path, required=True, metavar="RUN")
     fit.add_argument("--template", default="builtin", metavar="builtin|mano:FILE|gltf:FILE")
     fit.add_argument("--tracks", type=Path, metavar="FILE", help="use this tracks.json, do not track")
-    fit.add_argument("--masks", type=Path, metavar="DIR", help="DIR/%%06d.png: 0 background, 128 ignore, 255 hand")
+    fit.add_argument(
+        "--masks", type=Path, metavar="DIR", help="DIR/%%06d.png: 0 background, 128 ignore, 255 hand"
+    )
     fit.add_argument("--side", choices=SIDES, default="auto")
     fit.add_argument("--preset", choices=PRESETS, default="auto")
-    fit.add_argument("--holdout", type=int, default=0, metavar="N", help="keep every N-th frame out of the fit")
+    fit.add_argument(
+        "--holdout", type=int, default=0, metavar="N", help="keep every N-th frame out of the fit"
+    )
     fit.add_argument("--seed", type=int, default=0)
     fit.add_argument("--device", choices=DEVICES, default="auto")
     fit.add_argument("--fov", type=float, metavar="DEGREES", help="field of view of the longer image side")
@@ -45,8 +52,15 @@ def build_parser() -> argparse.ArgumentParser:
     render = commands.add_parser("render", help="render an avatar: its frames, or any pose and camera")
     render.add_argument("run_dir", type=Path, metavar="RUN")
     render.add_argument("--frames", metavar="all|holdout|12,40")
-    render.add_argument("--pose", metavar="SPEC", help="rest, fist, point, pinch, spread, frame:12 or 48 numbers")
-    render.add_argument("--camera", default="orbit:0,0", metavar="SPEC", help="source, orbit:YAW,PITCH[,METRES] or a JSON file")
+    render.add_argument(
+        "--pose", metavar="SPEC", help="rest, fist, point, pinch, spread, frame:12 or 48 numbers"
+    )
+    render.add_argument(
+        "--camera",
+        default="orbit:0,0",
+        metavar="SPEC",
+        help="source, orbit:YAW,PITCH[,METRES] or a JSON file",
+    )
     render.add_argument("--size", default="512x512", metavar="WxH")
     render.add_argument("--out", type=Path, required=True)
     render.set_defaults(run=_render)
@@ -171,8 +185,7 @@ def _export(arguments: argparse.Namespace) -> None:
     from mass_engine.export.ply import write_ply
 
     avatar = Avatar.load(arguments.run_dir)
-    flavour = "3dgs" if arguments.format == "ply3d" else "2dgs"
-    write_ply(avatar.cloud(arguments.pose), arguments.out, flavour)
+    write_ply(avatar.cloud(arguments.pose), arguments.out, "3dgs" if arguments.format == "ply3d" else "2dgs")
     print(f"wrote {arguments.out}")
 
 

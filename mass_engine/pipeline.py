@@ -68,7 +68,9 @@ def fit(
     meter.close()
     summary = FitReport(
         video={"name": video.name, **asdict(clip.info), "frames_read": clip.frames_read},
-        options={name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()},
+        options={
+            name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()
+        },
         side=clip.model.side,
         fov={"degrees": options.fov or ASSUMED_FOV, "assumed": clip.fov_assumed},
         frames={

@@ -77,7 +77,12 @@ def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) 
 
 
 def _landmarks(
-    video: Path, info: VideoInfo, options: FitOptions, imported: Tracks | None, meter: ProgressMeter, warn: Warn
+    video: Path,
+    info: VideoInfo,
+    options: FitOptions,
+    imported: Tracks | None,
+    meter: ProgressMeter,
+    warn: Warn,
 ) -> tuple[list[HandLandmarks], dict[int, float]]:
     """Trusted landmarks of the main hand in time order, and the time of every frame read."""
     times: dict[int, float] = {}
@@ -102,7 +107,9 @@ def _landmarks(
         pass
     world = imported.joints3d - imported.joints3d.mean(1, keepdims=True)
     marks = [
-        HandLandmarks(index, imported.pose.side, imported.landmarks2d[row], world[row], imported.scores[row], 0.5)
+        HandLandmarks(
+            index, imported.pose.side, imported.landmarks2d[row], world[row], imported.scores[row], 0.5
+        )
         for row, index in enumerate(imported.indices)
         if index in times
     ]
@@ -149,14 +156,16 @@ def _cut_views(
             meter.update("segment", 0.2 * len(crops) / len(marks))
         if frame.index >= last:
             break
-    moved = [replace(mark, points=mark.points - np.float32([box[0], box[1]])) for mark, box, _ in crops]
+    moved = [replace(mark, points=mark.points - np.array(box[:2], np.float32)) for mark, box, _ in crops]
     if options.masks is None:
         train = [row for row, (mark, _, _) in enumerate(crops) if not options.is_heldout(mark.index)]
         picked = np.unique(np.linspace(0, len(train) - 1, min(MASK_SAMPLES, len(train))).round().astype(int))
         segmenter = HandSegmenter.train([(crops[train[i]][2], moved[train[i]]) for i in picked])
         with ThreadPoolExecutor(2) as pool:
             masks = []
-            for done, mask in enumerate(pool.map(lambda i: segmenter(crops[i][2], moved[i]), range(len(crops)))):
+            for done, mask in enumerate(
+                pool.map(lambda i: segmenter(crops[i][2], moved[i]), range(len(crops)))
+            ):
                 masks.append(mask)
                 meter.update("segment", 0.2 + 0.8 * (done + 1) / len(crops))
     else:

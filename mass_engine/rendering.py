@@ -23,10 +23,14 @@ def render_frames(run: Path, frames: str, out: Path) -> int:
     if frames == "holdout":
         indices = avatar.frames.indices[avatar.frames.heldout].tolist()
         if not indices:
-            raise BadArgumentError("render.no_holdout", "No frame was held out.", "Fit with --holdout 8, say.")
+            raise BadArgumentError(
+                "render.no_holdout", "No frame was held out.", "Fit with --holdout 8, say."
+            )
     elif frames != "all":
         if re.fullmatch(r"\d{1,9}(,\d{1,9})*", frames) is None:
-            raise BadArgumentError("render.frames", f"{frames!r} names no frames.", "Use all, holdout or 12,40.")
+            raise BadArgumentError(
+                "render.frames", f"{frames!r} names no frames.", "Use all, holdout or 12,40."
+            )
         indices = [int(number) for number in frames.split(",")]
     out.mkdir(parents=True, exist_ok=True)
     for index in indices:
@@ -46,7 +50,9 @@ def render_to_file(run: Path, pose: str, camera: str, size: str, out: Path) -> N
             camera = Path(camera).read_text()
         except (OSError, UnicodeDecodeError) as error:
             raise BadArgumentError(
-                "camera.invalid", f"There is no camera file {camera!r}.", "Use source, orbit:YAW,PITCH or a JSON file."
+                "camera.invalid",
+                f"There is no camera file {camera!r}.",
+                "Use source, orbit:YAW,PITCH or a JSON file.",
             ) from error
     _write(Avatar.load(run).render(pose, camera, width, height), out)
 

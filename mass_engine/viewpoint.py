@@ -20,9 +20,7 @@ _MOST_PIXELS = 64_000_000
 _FILL = 0.95
 
 
-def parse_camera(
-    spec: str, source: Camera, width: int, height: int, center: Tensor, radius: float
-) -> Camera:
+def parse_camera(spec: str, source: Camera, width: int, height: int, center: Tensor, radius: float) -> Camera:
     """The camera that ``spec`` describes for a picture of ``width`` x ``height`` pixels.
 
     ``source`` is the fitted camera; an orbit looks at ``center`` [3] (world metres), where the hand fits
@@ -56,13 +54,17 @@ def _orbit(text: str, source: Camera, width: int, height: int, center: Tensor, r
     except ValueError:
         numbers = []
     if len(numbers) not in (2, 3) or not all(math.isfinite(number) for number in numbers):
-        raise BadArgumentError("camera.invalid", f"The orbit {text[:80]!r} is not two or three numbers.", _ADVICE)
+        raise BadArgumentError(
+            "camera.invalid", f"The orbit {text[:80]!r} is not two or three numbers.", _ADVICE
+        )
     yaw, pitch = (math.radians(number % 360) for number in numbers[:2])
     focal = float(source.K[0, 0]) / max(source.width, source.height) * min(width, height)
     half_angle = math.atan(0.5 * min(width, height) * _FILL / focal)
     distance = numbers[2] if len(numbers) == 3 else radius / math.sin(half_angle)
     if not 0.02 <= distance <= 100:
-        raise BadArgumentError("camera.invalid", f"The distance {distance} m is out of range.", "Use 0.02 to 100 m.")
+        raise BadArgumentError(
+            "camera.invalid", f"The distance {distance} m is out of range.", "Use 0.02 to 100 m."
+        )
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     # From the source camera's axes: turn by yaw about its vertical, then by pitch about its horizontal.
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)

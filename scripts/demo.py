@@ -49,7 +49,9 @@ def main() -> int:
             with MassClient(f"http://127.0.0.1:{port}") as client:
                 _wait_ready(client, server)
                 print(f"service on http://127.0.0.1:{port}")
-                return _run_job(client, video, out, {"holdout": arguments.holdout, "preset": arguments.preset})
+                return _run_job(
+                    client, video, out, {"holdout": arguments.holdout, "preset": arguments.preset}
+                )
         except ServiceError as error:
             print(f"demo: {error.code}: {error}; see {out / 'service.log'}", file=sys.stderr)
             return 1

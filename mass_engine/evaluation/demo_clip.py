@@ -73,9 +73,7 @@ def demo_frames(options: ClipOptions | None = None) -> Iterator[NDArray[np.uint8
 
 
 def _batch(pose: HandPose, betas: Tensor) -> HandPose:
-    return HandPose(
-        betas[None], pose.global_orient[None], pose.hand_pose[None], pose.transl[None], pose.side
-    )
+    return HandPose(betas[None], pose.global_orient[None], pose.hand_pose[None], pose.transl[None], pose.side)
 
 
 def _motion(phase: float, shape: Shape) -> HandPose:
@@ -133,12 +131,12 @@ def _background(width: int, height: int, random: np.random.Generator) -> NDArray
     """A table top with boxes and papers of many colours."""
     small = random.normal(0, 1, (height // 16, width // 16)).astype(np.float32)
     cloud = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
-    picture = np.float32([0.46, 0.50, 0.52]) + 0.035 * cloud[..., None]
+    picture = np.array([0.46, 0.50, 0.52], np.float32) + 0.035 * cloud[..., None]
     for _ in range(18):
         center = random.uniform((0, 0), (width, height))
         size = random.uniform(20, 110, 2)
         corners = cv2.boxPoints((tuple(center), tuple(size), float(random.uniform(0, 180))))
-        hue = np.uint8([[[random.integers(60, 150), random.integers(30, 150), random.integers(60, 230)]]])
+        hue = random.integers((60, 30, 60), (150, 150, 230)).astype(np.uint8).reshape(1, 1, 3)
         color = cv2.cvtColor(hue, cv2.COLOR_HSV2RGB)[0, 0].astype(np.float64) / 255
         cv2.fillPoly(picture, [corners.astype(np.int32)], tuple(color))
     return np.asarray(np.clip(picture, 0, 1), np.float32)

@@ -102,7 +102,11 @@ class AppearanceFit:
             kinds = torch.stack([level.hand * level.colored, forearm, (1 - level.hand) * level.valid], -1)
             (weights,) = torch.autograd.grad(out.rgb, colors, kinds)
             shading = (irradiance_basis(surfels.attached.normals[0]) @ light).clamp_min(0.05)
-            hand, ignored, background = hand + weights[:, 0], ignored + weights[:, 1], background + weights[:, 2]
+            hand, ignored, background = (
+                hand + weights[:, 0],
+                ignored + weights[:, 1],
+                background + weights[:, 2],
+            )
             numerator += shading * seen
             denominator += shading.square() * weights[:, :1]
             if progress is not None:
@@ -135,7 +139,7 @@ class AppearanceFit:
                 group["lr"] = APPEARANCE_RATES[name] * stage.rate * decay
             optimizer.zero_grad(set_to_none=True)
             loss = self._loss(appearance, stage, self.views[row].level(stage.side), row)
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             if not all(bool(torch.isfinite(value.grad).all()) for value in parameters.values()):
                 self.rejected_steps += 1
                 continue
@@ -196,5 +200,3 @@ def _face_pairs(faces: Tensor) -> Tensor:
     same = edge_id[order][1:] == edge_id[order][:-1]
     left, right = owner[order][:-1][same], owner[order][1:][same]
     return torch.cat([torch.stack([left, right], 1), torch.stack([right, left], 1)])
-
-

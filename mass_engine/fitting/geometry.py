@@ -54,7 +54,7 @@ class GeometryPass:
 
 
 #: Learning rates of what all frames share: standard deviations, metres, colour, light.
-SHARED_RATES = {"betas": 0.02, "displacement": 1.5e-4, "albedo": 0.02, "light": 0.005}
+SHARED_RATES = {"betas": 0.02, "displacement": 1.5e-4, "albedo": 0.005, "light": 0.005}
 
 
 class GeometryFit:
@@ -115,7 +115,7 @@ class GeometryFit:
             leaves = self.table.leaves(chosen)
             optimizer.zero_grad(set_to_none=True)
             loss = self._loss(stage, binding, appearance, chosen, leaves)
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             if not self._finite(loss, leaves, shared):
                 self.rejected_steps += 1  # a step that would poison the state is not taken
                 continue
@@ -200,7 +200,7 @@ class GeometryFit:
 
 
 def _neighbours(views: list[View], trained: list[int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """For every row: the training rows before and after, where between them it lies, and how near they are."""
+    """For every row: the training rows before and after, its place between them, and how near they are."""
     before, after = torch.arange(len(views)), torch.arange(len(views))
     mix, near = torch.full((len(views),), 0.5), torch.zeros(len(views))
     for row, view in enumerate(views):

@@ -36,7 +36,9 @@ def outline_distance(vertices: Tensor, points: Tensor, outside: Tensor) -> Tenso
     if len(points) > 0:
         with torch.no_grad():
             nearest = torch.cdist(points, vertices).argmin(1)
-        total = total + charbonnier((vertices[nearest] - points).square().sum(-1).add(1e-6).sqrt(), 2.0).mean()
+        total = (
+            total + charbonnier((vertices[nearest] - points).square().sum(-1).add(1e-6).sqrt(), 2.0).mean()
+        )
     grid = vertices / torch.tensor([width / 2, height / 2]) - 1
     depth = functional.grid_sample(outside, grid[None, None], padding_mode="border", align_corners=False)
     return total + charbonnier(depth, 2.0).mean() * 4
@@ -56,7 +58,8 @@ def dssim(rgb: Tensor, target: Tensor, valid: Tensor) -> Tensor:
         (mx * mx + my * my + _C1) * ((xx - mx * mx).clamp_min(0) + (yy - my * my).clamp_min(0) + _C2)
     )
     weight = valid.sum().clamp_min(1.0)
-    return ((1 - ssim.mean(0)) * 0.5 * valid).sum() / weight
+    loss: Tensor = ((1 - ssim.mean(0)) * 0.5 * valid).sum() / weight
+    return loss
 
 
 def laplacian(values: Tensor, edges: Tensor) -> Tensor:

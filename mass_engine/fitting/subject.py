@@ -29,7 +29,8 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 def mesh_edges(faces: Tensor) -> Tensor:
     """Unique undirected edges [E,2] of ``faces`` [F,3]."""
     pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return torch.unique(pairs.sort(dim=1).values, dim=0)
+    edges: Tensor = torch.unique(pairs.sort(dim=1).values, dim=0)
+    return edges
 
 
 @dataclass
@@ -65,8 +66,11 @@ class Appearance:
 
 @dataclass
 class PosedSurfels:
-    """Surfels of a batch of poses (means [B,N,3], tangents [B,N,2,3], normals [B,N,3]), with
-    ``bone_rotations`` [B,16,3,3], ``joints`` [B,21,3] and the refined mesh's ``outline_vertices`` [B,V',3]."""
+    """Surfels of a batch of poses (means [B,N,3], tangents [B,N,2,3], normals [B,N,3]).
+
+    With ``bone_rotations`` [B,16,3,3], ``joints`` [B,21,3] and the refined mesh's ``outline_vertices``
+    [B,V',3].
+    """
 
     attached: AttachedSurfels
     outline_vertices: Tensor

@@ -22,9 +22,10 @@ from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import white_light
 from mass_engine.tracking.alignment import interpolate_pose
 
-
-#: How far from the stump's end the hand may be cut, metres at the mean size: up to the wrist's crease and a little on.
+#: How far from the stump's end the hand may be cut, metres at the mean size: a little past the wrist.
 WRIST_REACH = 0.06
+#: What a pixel of forearm counts against one of hand when the wrist is cut: better a little too long.
+FOREARM_WEIGHT = 0.3
 
 
 @dataclass(frozen=True)
@@ -49,14 +50,14 @@ def schedule_for(preset: str) -> Schedule:
     """The schedule of a preset (draft, auto, full)."""
     rough = GeometryWeights(landmarks=1.0, outline=20.0, limits=1.0)
     middle = GeometryWeights(landmarks=0.1, outline=20.0)
-    fine = GeometryWeights(landmarks=0.05, outline=10.0)
+    fine = GeometryWeights(color=4.0, landmarks=0.02, outline=10.0, smooth=1.0)
     first = GeometryPass(96, 10, rate=2.0, color=False, weights=rough)
     heldout = (
         replace(first, visits=8, levels=1, depth=0, rate=1.0, shared=False, weights=middle),
         GeometryPass(256, 8, levels=1, rate=0.4, color=False, shared=False, weights=fine),
     )
     if preset == "draft":
-        geometry = (
+        geometry: tuple[GeometryPass, ...] = (
             replace(first, visits=8),
             GeometryPass(160, 8, levels=1, depth=0, rate=1.5, weights=middle),
         )
@@ -64,7 +65,7 @@ def schedule_for(preset: str) -> Schedule:
     geometry = (
         first,
         GeometryPass(160, 14, levels=1, depth=0, rate=1.5, weights=middle),
-        GeometryPass(320, 16, levels=1, depth=1, rate=0.8, weights=fine),
+        *(GeometryPass(320, 6, levels=1, depth=1, rate=rate, weights=fine) for rate in (0.8, 0.6, 0.4)),
     )
     appearance = (AppearancePass(320, 2), AppearancePass(640, 3, rate=0.7, view_dependent=True))
     if preset == "auto":
@@ -102,7 +103,7 @@ def fit_hand(
     raster = RasterOptions(cull_backfaces=True)
     table = PoseTable(start)
     shape = Shape.mean(model, start.betas[0])
-    shares = _shares(schedule, views)
+    shares = _shares(schedule)
     done = 0.0
 
     def part(share: float, note: str) -> Callable[[float], None]:
@@ -176,7 +177,7 @@ class _Shares:
     appearance: list[float]
 
 
-def _shares(schedule: Schedule, views: list[View]) -> _Shares:
+def _shares(schedule: Schedule) -> _Shares:
     """How the time divides over the passes: by pixels and visits, with a constant part a step."""
     first = [stage.visits * (60.0**2 + stage.side**2) for stage in schedule.geometry]
     second = [stage.visits * 2 * (60.0**2 + stage.side**2) for stage in schedule.appearance]
@@ -201,21 +202,35 @@ def _logit(probability: float) -> float:
 def _keep(evidence: Evidence, binding: MeshBinding, model: HandModel) -> Tensor:
     """Surfels to keep: the hand ends where the clip shows it to end (a sleeve, a watch, the frame).
 
-    Along the forearm's axis the cut is put where it agrees best with what was seen as hand on one side and
-    as forearm or background on the other; everything beyond it goes, seen or not.
+    Around the wrist a plane is put between what was seen as hand and what was seen as forearm or background
+    (logistic regression on rest positions, weighted by evidence); all beyond it goes, seen or not.
     """
     with torch.no_grad():
-        along = binding.surfels(model.template).means[:, 0]  # the forearm runs along +x of the right hand
-    along = along if model.side == "right" else -along
+        places = binding.surfels(model.template).means
+    along = places[:, 0] if model.side == "right" else -places[:, 0]  # the forearm's axis, outward
     wrist = along > along.max() - WRIST_REACH
-    order = along[wrist].argsort()
-    gain = (0.15 * (evidence.ignored + evidence.background) - evidence.hand)[wrist][order]
-    # Cutting before rank k gains what lies beyond it.
-    beyond = torch.cat([gain.flip(0).cumsum(0).flip(0), torch.zeros(1)])
-    rank = int(beyond.argmax())
-    sorted_along = along[wrist][order]
-    cut = float("inf") if rank == len(sorted_along) else float(sorted_along[rank])
-    return (along < cut).nonzero()[:, 0]
+    hand = evidence.hand[wrist]
+    other = FOREARM_WEIGHT * (evidence.ignored + evidence.background)[wrist]
+    if float(other.sum()) < 0.01 * float(hand.sum()):
+        return torch.arange(binding.count)
+    centered = (places[wrist] - places[wrist].mean(0)) / WRIST_REACH
+    plane = torch.zeros(4, requires_grad=True)
+    optimizer = torch.optim.LBFGS([plane], max_iter=60, line_search_fn="strong_wolfe")
+    total = (hand + other).sum()
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        score = 20 * (centered @ plane[:3] + plane[3])
+        softplus = torch.nn.functional.softplus
+        loss = (hand * softplus(-score) + other * softplus(score)).sum() / total + 1e-3 * plane.square().sum()
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+    with torch.no_grad():
+        keep = torch.ones(binding.count, dtype=torch.bool)
+        keep[wrist] = centered @ plane[:3] + plane[3] > 0
+    return keep.nonzero()[:, 0]
 
 
 def _place_heldout(views: list[View], table: PoseTable, start: HandPose) -> None:
@@ -242,5 +257,3 @@ def _best_frame(views: list[View]) -> int:
     """The training frame whose hand covers most of the picture, at full confidence."""
     trained = [view for view in views if not view.heldout]
     return max(trained, key=lambda view: float((view.labels == 255).sum()) * view.score).index
-
-

@@ -13,7 +13,6 @@ from torch import Tensor
 from mass_engine.camera import Camera
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE
 
-
 #: Width in pixels of the seam along ignored regions in which colours are not trusted.
 SEAM = 7
 #: Most points an outline is described by.
@@ -22,8 +21,10 @@ OUTLINE_POINTS = 192
 
 @dataclass(frozen=True)
 class Level:
-    """One resolution of a view: ``rgb`` [h,w,3] in 0..1, ``hand`` [h,w] coverage in 0..1; ``valid`` [h,w] is 0
-    where the mask ignores, ``colored`` [h,w] also where colours may be mixed with what is ignored."""
+    """One resolution of a view: ``rgb`` [h,w,3] in 0..1, ``hand`` [h,w] coverage in 0..1.
+
+    ``valid`` [h,w] is 0 where the mask ignores, ``colored`` [h,w] also where colours may be mixed with it.
+    """
 
     rgb: Tensor
     hand: Tensor
@@ -34,8 +35,8 @@ class Level:
 
 @dataclass(frozen=True)
 class Outline:
-    """``points`` [C,2]: where hand meets background, in pixels of the crop. ``outside`` [1,1,h,w]: distance in
-    pixels from each pixel to the nearest one that is hand or ignored."""
+    """``points`` [C,2]: where hand meets background, in pixels of the crop. ``outside`` [1,1,h,w]: distance
+    in pixels from each pixel to the nearest one that is hand or ignored."""
 
     points: Tensor
     outside: Tensor
@@ -65,7 +66,7 @@ class View:
     def outline(self) -> Outline:
         """The hand's outline and the distances outside it (kept for the next call)."""
         if self._outline is None:
-            self._outline = _trace(self.labels, self.camera)
+            self._outline = _trace(self.labels)
         return self._outline
 
     def _reduce(self, side: int) -> Level:
@@ -78,7 +79,7 @@ class View:
         near = cv2.dilate(ignore, np.ones((SEAM, SEAM), np.uint8))
         rgb = self.rgb
         if scale < 1:
-            rgb = cv2.resize(rgb, (w, h), interpolation=cv2.INTER_AREA)
+            rgb = np.asarray(cv2.resize(rgb, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
             hand, ignore, near = (
                 cv2.resize(m, (w, h), interpolation=cv2.INTER_AREA) for m in (hand, ignore, near)
             )
@@ -91,7 +92,7 @@ class View:
         )
 
 
-def _trace(labels: NDArray[np.uint8], camera: Camera) -> Outline:
+def _trace(labels: NDArray[np.uint8]) -> Outline:
     """The outline of the hand label, without what borders on ignored pixels or on the crop's edge."""
     height, width = labels.shape
     hand = (labels == HAND).astype(np.uint8)
@@ -99,11 +100,14 @@ def _trace(labels: NDArray[np.uint8], camera: Camera) -> Outline:
     free[2:-2, 2:-2] = True
     free &= cv2.dilate((labels == IGNORE).astype(np.uint8), np.ones((SEAM, SEAM), np.uint8)) == 0
     contours, _ = cv2.findContours(hand, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    pixels = np.concatenate([c.reshape(-1, 2) for c in contours if len(c) >= 12] or [np.zeros((0, 2), np.int32)])
+    pixels = np.concatenate(
+        [c.reshape(-1, 2) for c in contours if len(c) >= 12] or [np.zeros((0, 2), np.int32)]
+    )
     pixels = pixels[free[pixels[:, 1], pixels[:, 0]]] if len(pixels) else pixels
     if len(pixels) > OUTLINE_POINTS:
         pixels = pixels[np.linspace(0, len(pixels) - 1, OUTLINE_POINTS).round().astype(int)]
     outside = cv2.distanceTransform((labels == BACKGROUND).astype(np.uint8), cv2.DIST_L2, 3)
     return Outline(
-        torch.from_numpy(pixels.astype(np.float32) + 0.5), torch.from_numpy(outside.astype(np.float32))[None, None]
+        torch.from_numpy(pixels.astype(np.float32) + 0.5),
+        torch.from_numpy(outside.astype(np.float32))[None, None],
     )

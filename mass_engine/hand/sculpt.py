@@ -46,9 +46,7 @@ def _mesh(tissues: Sequence[Tissue]) -> tuple[Vector, Faces]:
     axes = [np.arange(low, high, _CELL) for low, high in zip(_LOW, _HIGH, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     values = distance_field(grid.reshape(-1, 3), tissues).reshape(grid.shape[:3])
-    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
-        values, 0.0, spacing=(_CELL,) * 3
-    )
+    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(_CELL,) * 3)
     vertices = vertices.astype(np.float64) + np.array(_LOW)
     faces = faces.astype(np.int64)
     corners = vertices[faces]

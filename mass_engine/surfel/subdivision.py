@@ -29,9 +29,7 @@ class Subdivision:
         lead, (count, channels) = vertices.shape[:-2], vertices.shape[-2:]
         # One product for the whole batch: columns are (batch, channel).
         columns = vertices.reshape(-1, count, channels).movedim(1, 0).reshape(count, -1)
-        product: Tensor = _FixedProduct.apply(  # type: ignore[no-untyped-call]
-            columns, self._matrix, self._transpose
-        )
+        product: Tensor = _FixedProduct.apply(columns, self._matrix, self._transpose)  # type: ignore[no-untyped-call]
         return product.reshape(self.n_vertices, -1, channels).movedim(0, 1).reshape(*lead, -1, channels)
 
 

@@ -79,8 +79,8 @@ def initial_pose(model: HandModel, landmarks: Sequence[HandLandmarks], camera: C
         pixels = mark.points[list(PALM_POINTS)]
         shown = turned[list(PALM_POINTS), :2]
         spread = np.linalg.norm(shown - shown.mean(0)) + 1e-6
-        depth = focal * spread / (np.linalg.norm(pixels - pixels.mean(0)) + 1e-6)
-        depth = float(np.clip(depth, 0.1, 5.0))
+        depth = focal * float(spread) / (float(np.linalg.norm(pixels - pixels.mean(0))) + 1e-6)
+        depth = min(max(depth, 0.1), 5.0)
         xy = (pixels.mean(0) - center) / focal * depth
         anchor = turned[list(PALM_POINTS)].mean(0)
         orient.append(rotation.as_rotvec())
@@ -171,7 +171,7 @@ def align_landmarks(
         if len(landmarks) > 2 and w.smooth > 0:
             bend = (joints[2:] - 2 * joints[1:-1] + joints[:-2]) / 0.18
             loss = loss + w.smooth * (smooth_weight * bend.square().sum(-1).mean(-1)).mean()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimizer.step()
         schedule.step()
         error = pixel_error.detach().mean(-1)

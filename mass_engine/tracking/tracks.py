@@ -1,4 +1,4 @@
-"""tracks.json: the poses of a clip as one readable file, written by every fit and accepted by ``--tracks``."""
+"""tracks.json: the poses of a clip in one readable file; every fit writes it, ``--tracks`` takes it."""
 
 from __future__ import annotations
 

@@ -14,7 +14,11 @@ from mass_engine.cli import main
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "mass_engine", *arguments], capture_output=True, text=True, timeout=300, check=False
+        [sys.executable, "-m", "mass_engine", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
     )
 
 
@@ -51,7 +55,17 @@ def test_unusable_input_exits_with_3_and_says_why(tmp_path: Path) -> None:
 
 
 def test_fit_reports_monotonic_progress_as_json_lines(demo_clip: Path, tmp_path: Path) -> None:
-    done = run("fit", str(demo_clip), "--out", str(tmp_path / "run"), "--preset", "draft", "--max-frames", "12", "--json")
+    done = run(
+        "fit",
+        str(demo_clip),
+        "--out",
+        str(tmp_path / "run"),
+        "--preset",
+        "draft",
+        "--max-frames",
+        "12",
+        "--json",
+    )
     assert done.returncode == 0, done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     fractions = [line["fraction"] for line in lines if line["type"] == "progress"]

@@ -26,7 +26,9 @@ def test_run_directory_holds_what_is_promised(draft_run: Path) -> None:
     assert report["peak_memory_bytes"] > 0
     assert {"track", "segment", "align", "fit"} <= report["seconds"].keys()
     assert {"torch", "numpy", "python"} <= report["versions"].keys()
-    assert len(trimesh.load(draft_run / "surfels.ply").vertices) == report["surfels"]["kept"]
+    cloud = trimesh.load(draft_run / "surfels.ply")
+    assert isinstance(cloud, trimesh.PointCloud)
+    assert len(cloud.vertices) == report["surfels"]["kept"]
     tracks = json.loads((draft_run / "tracks.json").read_text())
     assert [frame["index"] for frame in tracks["frames"]] == sorted(
         report["frames"]["heldout"] + report["frames"]["fitted"]
@@ -93,6 +95,7 @@ def test_frames_are_rendered_at_the_videos_size(draft_run: Path, tmp_path: Path)
     assert len(files) == count > 0
     assert files[0].name == f"{int(files[0].stem):06d}.png"
     picture = cv2.imread(str(files[0]), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
     assert picture.shape == (360, 480, 4)
     with pytest.raises(BadArgumentError):
         render_frames(draft_run, "some", tmp_path)

@@ -52,7 +52,9 @@ def test_yaw_moves_the_camera_right_and_pitch_up() -> None:
 
 def test_without_a_distance_the_hand_fits_the_picture() -> None:
     camera = orbit("orbit:20,10")
-    around = CENTER + 0.1 * torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.manual_seed(0)), dim=-1)
+    around = CENTER + 0.1 * torch.nn.functional.normalize(
+        torch.randn(500, 3, generator=torch.manual_seed(0)), dim=-1
+    )
     pixels = camera.project(around)
     assert float(pixels.min()) >= 0
     assert float(pixels.max()) <= 512

@@ -48,7 +48,7 @@ def test_rotation_gradient_is_finite_and_right_at_every_angle(size: float) -> No
     vector.requires_grad_(True)
     assert torch.autograd.gradcheck(axis_angle_to_matrix, (vector,), eps=1e-5, atol=1e-6)
     single = vector.detach().float().requires_grad_(True)
-    axis_angle_to_matrix(single)[0, 1].backward()  # type: ignore[no-untyped-call]
+    axis_angle_to_matrix(single)[0, 1].backward()
     assert single.grad is not None
     assert torch.isfinite(single.grad).all()
 
@@ -175,7 +175,7 @@ def test_gradient_at_rest_is_finite(model: HandModel) -> None:
         for value in (pose.betas, pose.global_orient, pose.hand_pose, pose.transl)
     ]
     vertices, joints = model(HandPose(leaves[0], leaves[1], leaves[2], leaves[3]))
-    (vertices.square().sum() + joints.sum()).backward()  # type: ignore[no-untyped-call]
+    (vertices.square().sum() + joints.sum()).backward()
     for leaf in leaves:
         assert leaf.grad is not None
         assert torch.isfinite(leaf.grad).all()

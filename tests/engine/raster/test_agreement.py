@@ -116,7 +116,7 @@ def test_part_of_the_gradients() -> None:
             weight = torch.randn(images(render(scene, view))[other].shape, generator=g)
             if other == name:
                 break
-        (image * weight).sum().backward()  # type: ignore[no-untyped-call]
+        (image * weight).sum().backward()
         for key, leaf in zip(("means", "quats", "scales", "opacities", "colors"), leaves, strict=True):
             got = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
             assert float((got - expected[key]).norm()) <= 5e-3 * float(expected[key].norm()) + 1e-12, (

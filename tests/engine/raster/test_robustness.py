@@ -75,7 +75,7 @@ def test_exactly_edge_on_disks_show_their_low_pass_part() -> None:
         assert float(alpha[4, 5]) == pytest.approx(expected, abs=1e-5)
         assert float(alpha[5, 4]) == pytest.approx(expected, abs=1e-5)
         assert float(depth[4, 5]) == pytest.approx(1.0, abs=1e-5)
-        (out.rgb.sum() + out.depth.sum()).backward()  # type: ignore[no-untyped-call]
+        (out.rgb.sum() + out.depth.sum()).backward()
         assert all(leaf.grad is not None and bool(torch.isfinite(leaf.grad).all()) for leaf in leaves)
         assert float(leaves[2].grad.abs().max()) == 0.0  # type: ignore[union-attr]
 
@@ -86,7 +86,7 @@ def test_background_and_its_gradient() -> None:
     over = rasterize(*scene.tensors(), view, background=background)
     plain = rasterize(*scene.tensors(), view)
     torch.testing.assert_close(over.rgb, plain.rgb + (1 - plain.alpha)[..., None] * background)
-    over.rgb.sum().backward()  # type: ignore[no-untyped-call]
+    over.rgb.sum().backward()
     assert background.grad is not None
     torch.testing.assert_close(background.grad, (1 - plain.alpha).sum().expand(3), rtol=1e-4, atol=0)
     image = torch.rand(view.height, view.width, 3)
@@ -142,7 +142,7 @@ def test_graphs_alive_at_once_do_not_share_buffers() -> None:
     for view in views:
         leaf = scene.means.clone().requires_grad_()
         out = render(replace(scene, means=leaf), view, EVERYTHING, renderer)
-        out.rgb.sum().backward()  # type: ignore[no-untyped-call]
+        out.rgb.sum().backward()
         alone.append(leaf.grad)
     leaves = [scene.means.clone().requires_grad_() for _ in views]
     outs = [
@@ -150,12 +150,12 @@ def test_graphs_alive_at_once_do_not_share_buffers() -> None:
         for leaf, view in zip(leaves, views, strict=True)
     ]
     for out in reversed(outs):
-        out.rgb.sum().backward(retain_graph=True)  # type: ignore[no-untyped-call]
+        out.rgb.sum().backward(retain_graph=True)
     for leaf, expected in zip(leaves, alone, strict=True):
         assert leaf.grad is not None
         assert expected is not None
         assert torch.equal(leaf.grad, expected)
-    outs[0].rgb.sum().backward()  # type: ignore[no-untyped-call]
+    outs[0].rgb.sum().backward()
     assert torch.equal(leaves[0].grad, 2 * alone[0])  # type: ignore[arg-type,operator]
 
 

@@ -125,7 +125,7 @@ def test_batches_and_gradient_to_the_pose() -> None:
     assert surfels.means.shape == (2, binding.count, 3)
     scales, quats = surfels.scales_quats()
     assert scales.shape == (2, binding.count, 2)
-    (surfels.means.sum() + scales.sum() + quats.sum()).backward()  # type: ignore[no-untyped-call]
+    (surfels.means.sum() + scales.sum() + quats.sum()).backward()
     assert fingers.grad is not None
     assert torch.isfinite(fingers.grad).all()
     assert fingers.grad.abs().max() > 0

@@ -17,11 +17,14 @@ from mass_engine.tracking.tracks import Tracks, read_tracks, write_tracks
 
 def tracks() -> Tracks:
     random = torch.Generator().manual_seed(1)
-    pose = HandPose(*(torch.randn(3, n, generator=random) for n in (10, 3, 45, 3)), side="left")
+    betas, orient, fingers, transl = (torch.randn(3, n, generator=random) for n in (10, 3, 45, 3))
+    pose = HandPose(betas, orient, fingers, transl, "left")
     points = torch.randn(3, 21, 3, generator=random).numpy()
     pixels = (torch.rand(3, 21, 2, generator=random) * 100).numpy()
     K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-    return Tracks("clip.mp4", 29.97, (640, 480), K, [0, 2, 5], [0.0, 0.07, 0.17], pose, points, pixels, [0.9, 1.0, 0.5])
+    return Tracks(
+        "clip.mp4", 29.97, (640, 480), K, [0, 2, 5], [0.0, 0.07, 0.17], pose, points, pixels, [0.9, 1.0, 0.5]
+    )
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
@@ -55,7 +58,9 @@ def spoil(change: str) -> Any:
     return apply
 
 
-@pytest.mark.parametrize("change", ["short pose", "nan", "no betas", "text", "no frames", "frames are a number"])
+@pytest.mark.parametrize(
+    "change", ["short pose", "nan", "no betas", "text", "no frames", "frames are a number"]
+)
 def test_incomplete_tracks_are_refused(tmp_path: Path, change: str) -> None:
     path = tmp_path / "tracks.json"
     write_tracks(tracks(), path)

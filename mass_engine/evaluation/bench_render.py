@@ -37,9 +37,7 @@ def run(argv: Sequence[str]) -> None:
     pose = HandPose(
         fist.betas[None], orient[None], fist.hand_pose[None], torch.tensor([[0.0, 0.08, 0.25]]), "right"
     )
-    print(
-        f"{platform.machine()}, {os.cpu_count()} cores, median of {repeat} (least to greatest), milliseconds\n"
-    )
+    print(f"{platform.machine()}, {os.cpu_count()} cores, median of {repeat} (least to greatest), ms\n")
     print("| surfels | size | pose to surfels | pose to pixels | frames a second |")
     print("|---|---|---|---|---|")
     for levels, depth in MODELS:
@@ -67,7 +65,8 @@ def run(argv: Sequence[str]) -> None:
             first, _, _ = _times(posing, repeat)
             median, least, most = _times(drawing, repeat)
             print(
-                f"| {binding.count} | {width}x{height} | {first:.1f} | {median:.1f} ({least:.1f} to {most:.1f}) "
+                f"| {binding.count} | {width}x{height} | {first:.1f} "
+                f"| {median:.1f} ({least:.1f} to {most:.1f}) "
                 f"| {1000 / median:.0f} |"
             )
 

@@ -160,7 +160,9 @@ class AppearanceFit:
         loss = losses.photometric(out.rgb, target, level.colored, area)
         if stage.dssim > 0:
             inside = level.colored * (level.hand > 0)
-            loss = (1 - stage.dssim) * loss + stage.dssim * 2 * losses.dssim(out.rgb, target, inside)
+            window = level.hand_window()
+            structure = losses.dssim(out.rgb[window], target[window], inside[window])
+            loss = (1 - stage.dssim) * loss + stage.dssim * 2 * structure
         return loss + 0.5 * losses.silhouette(out.alpha, level.hand, level.valid, area)
 
 

@@ -32,6 +32,16 @@ class Level:
     colored: Tensor
     camera: Camera
 
+    def hand_window(self) -> tuple[slice, slice]:
+        """Rows and columns of the hand's bounding box, a few pixels wider."""
+        rows, columns = self.hand.amax(1).nonzero(), self.hand.amax(0).nonzero()
+        if len(rows) == 0:
+            return slice(0, 1), slice(0, 1)
+        return (
+            slice(max(0, int(rows[0]) - 4), int(rows[-1]) + 5),
+            slice(max(0, int(columns[0]) - 4), int(columns[-1]) + 5),
+        )
+
 
 @dataclass(frozen=True)
 class Outline:

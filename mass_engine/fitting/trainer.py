@@ -25,7 +25,7 @@ from mass_engine.tracking.alignment import interpolate_pose
 #: How far from the stump's end the hand may be cut, metres at the mean size: a little past the wrist.
 WRIST_REACH = 0.06
 #: What a pixel of forearm counts against one of hand when the wrist is cut: better a little too long.
-FOREARM_WEIGHT = 0.3
+FOREARM_WEIGHT = 0.2
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ def schedule_for(preset: str) -> Schedule:
     """The schedule of a preset (draft, auto, full)."""
     rough = GeometryWeights(landmarks=1.0, outline=20.0, limits=1.0)
     middle = GeometryWeights(landmarks=0.1, outline=20.0)
-    fine = GeometryWeights(color=4.0, landmarks=0.02, outline=10.0, smooth=1.0)
+    fine = GeometryWeights(color=2.0, silhouette=3.0, landmarks=0.02, outline=15.0, smooth=1.0)
     first = GeometryPass(96, 10, rate=2.0, color=False, weights=rough)
     heldout = (
-        replace(first, visits=8, levels=1, depth=0, rate=1.0, shared=False, weights=middle),
-        GeometryPass(256, 8, levels=1, rate=0.4, color=False, shared=False, weights=fine),
+        replace(first, visits=20, levels=1, depth=0, rate=1.0, shared=False, weights=middle),
+        GeometryPass(256, 16, levels=1, rate=0.5, color=False, shared=False, weights=fine),
     )
     if preset == "draft":
         geometry: tuple[GeometryPass, ...] = (

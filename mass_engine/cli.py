@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import signal
 import sys
 import traceback
@@ -87,8 +86,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(stop.code or 0)
     json_lines = bool(getattr(arguments, "json", False))
     signal.signal(signal.SIGTERM, _interrupt)
-    # Torch's threads would spin between operations and starve the rasteriser's; set before torch is loaded.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         arguments.run(arguments)
     except EngineError as error:

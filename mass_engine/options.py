@@ -30,7 +30,7 @@ class FitOptions:
     seed: int = 0
     device: str = "auto"
     fov: float | None = None
-    max_frames: int = 240
+    max_frames: int = 160
 
     def __post_init__(self) -> None:
         checks = (

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-import os
 import signal
 import threading
 from collections import OrderedDict
@@ -53,8 +52,6 @@ class _EngineAvatar:
     """The engine's avatar with its errors in this module's terms."""
 
     def __init__(self, path: Path) -> None:
-        # Before torch loads: its threads would spin between operations and starve the rasteriser's.
-        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         from mass_engine import Avatar, EngineError
 
         try:

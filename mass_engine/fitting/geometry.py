@@ -54,7 +54,7 @@ class GeometryPass:
 
 
 #: Learning rates of what all frames share: standard deviations, metres, colour, light.
-SHARED_RATES = {"betas": 0.02, "displacement": 1.5e-4, "albedo": 0.005, "light": 0.005}
+SHARED_RATES = {"betas": 0.02, "displacement": 1.5e-4, "albedo": 0.02, "light": 0.005}
 
 
 class GeometryFit:

@@ -20,8 +20,11 @@ def photometric(rgb: Tensor, target: Tensor, valid: Tensor, area: Tensor) -> Ten
 
 
 def silhouette(alpha: Tensor, hand: Tensor, valid: Tensor, area: Tensor) -> Tensor:
-    """|alpha - hand| over the valid pixels, per pixel of hand area: paper's L_sil with ignore regions."""
-    return (charbonnier(alpha - hand, 0.05) * valid).sum() / area
+    """|alpha - hand| over the valid pixels, per pixel of hand area: paper's L_sil with ignore regions.
+
+    A hole in the hand counts double: it shows the background, what sticks out shows skin.
+    """
+    return (charbonnier(alpha - hand, 0.05) * valid * (1 + hand)).sum() / area
 
 
 def outline_distance(vertices: Tensor, points: Tensor, outside: Tensor) -> Tensor:
@@ -41,7 +44,7 @@ def outline_distance(vertices: Tensor, points: Tensor, outside: Tensor) -> Tenso
         )
     grid = vertices / torch.tensor([width / 2, height / 2]) - 1
     depth = functional.grid_sample(outside, grid[None, None], padding_mode="border", align_corners=False)
-    return total + charbonnier(depth, 2.0).mean() * 4
+    return total + charbonnier(depth, 2.0).mean() * 2
 
 
 def dssim(rgb: Tensor, target: Tensor, valid: Tensor) -> Tensor:

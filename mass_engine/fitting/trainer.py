@@ -50,7 +50,7 @@ def schedule_for(preset: str) -> Schedule:
     """The schedule of a preset (draft, auto, full)."""
     rough = GeometryWeights(landmarks=1.0, outline=20.0, limits=1.0)
     middle = GeometryWeights(landmarks=0.1, outline=20.0)
-    fine = GeometryWeights(color=2.0, silhouette=3.0, landmarks=0.02, outline=15.0, smooth=1.0)
+    fine = GeometryWeights(landmarks=0.02, outline=10.0)
     first = GeometryPass(96, 10, rate=2.0, color=False, weights=rough)
     heldout = (
         replace(first, visits=20, levels=1, depth=0, rate=1.0, shared=False, weights=middle),
@@ -65,7 +65,7 @@ def schedule_for(preset: str) -> Schedule:
     geometry = (
         first,
         GeometryPass(160, 14, levels=1, depth=0, rate=1.5, weights=middle),
-        *(GeometryPass(320, 6, levels=1, depth=1, rate=rate, weights=fine) for rate in (0.8, 0.6, 0.4)),
+        *(GeometryPass(320, visits, levels=1, depth=1, rate=0.8, weights=fine) for visits in (14, 8)),
     )
     appearance = (AppearancePass(320, 2), AppearancePass(640, 3, rate=0.7, view_dependent=True))
     if preset == "auto":

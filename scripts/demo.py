@@ -90,7 +90,7 @@ def _run_job(client: MassClient, video: Path, out: Path, options: dict[str, obje
     job = client.submit(video, options)
     print(f"job {job.id}")
     with FollowBar() as bar:
-        job = client.wait(job.id, bar.update)
+        job = client.wait(job.id, bar.show)
     if job.state != "succeeded":
         _explain(job)
         return 1

@@ -222,7 +222,11 @@ class Supervisor:
                 claim, "options.invalid", message, (said and said.advice) or "Submit with other options."
             )
         elif code == _EXIT_BAD_INPUT and said is not None and said.code:
-            return self._fail(claim, said.code, said.message, said.advice)
+            outcome = self._fail(claim, said.code, said.message, said.advice)
+            if outcome is Outcome.FAILED:
+                # No later attempt could use this video: nothing of it stays behind.
+                self._storage.discard_upload(claim.job_id)
+            return outcome
         else:
             log.error("job %s: the engine ended with %d: %s", claim.job_id, code, engine.tail)
         return self._again(claim, "engine.crashed", f"The engine stopped unexpectedly ({_describe(code)}).")

@@ -60,6 +60,7 @@ def test_a_video_the_engine_cannot_use_fails_with_its_code(running: Bench) -> No
     assert told == ("video.no_hand", "No hand was found.", "Film a hand.")
     assert len(running.starts(job_id)) == 1
     wait_for("its output is gone", lambda: not [*(running.settings.data_dir / "jobs" / job_id).iterdir()])
+    wait_for("its video is gone", lambda: not (running.settings.data_dir / "uploads" / job_id).exists())
 
 
 def test_arguments_the_engine_refuses_are_not_tried_again(running: Bench) -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.hand.builtin import joint_frames, joint_limits
-from mass_engine.hand.model import HandModel, axis_angle_to_matrix
+from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import JOINT_PARENTS, TIP_PARENTS, HandPose
 from mass_engine.tracking.landmarks import HandLandmarks
 
@@ -224,9 +224,3 @@ def interpolate_pose(pose: HandPose, times: Sequence[float], at: Sequence[float]
         torch.tensor(transl, dtype=torch.float32),
         pose.side,
     )
-
-
-def rotation_matrices(pose: HandPose) -> Tensor:
-    """Global orientation and the 15 joint rotations as matrices [...,16,3,3]."""
-    vectors = torch.cat([pose.global_orient, pose.hand_pose], -1)
-    return axis_angle_to_matrix(vectors.unflatten(-1, (16, 3)))

@@ -1,44 +1,35 @@
 """`mass-engine bench raster`: how fast the rasteriser is, next to its yardsticks, measured in one run.
 
-The scene is a hand-shaped closed surface (a palm and five fingers, rounded cones) covered by two layers of
-surfels that overlap as an avatar's do, seen so that it fills about a third of the image. Times are medians of
-interleaved repetitions with their quartiles.
+The scene is the built-in hand in a pose, its surface covered by two layers of surfels as an avatar's
+attached and detached ones lie. Times are medians of interleaved repetitions with their quartiles.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from mass_engine.camera import Camera
+from mass_engine.hand.builtin import load_builtin
+from mass_engine.hand.pose import HandPose
+from mass_engine.hand.poses import named_pose
 from mass_engine.raster import RasterOptions, RenderOutput, rasterize
 from mass_engine.raster import cpu as cpu_backend
-from mass_engine.raster._kernels import Renderer, instruction_sets
+from mass_engine.raster._kernels import instruction_sets
+from mass_engine.surfel.binding import MeshBinding
 
 SIZES = ((256, 256), (512, 334), (700, 500), (1400, 1000))
+#: The paper's counts: 1538 faces, one or two Loop levels, two layers, with and without densification.
 COUNTS = (12_304, 49_216, 196_864)
-
-# Rounded cones of a right hand in metres: start, end, radius at both. Palm first.
-_LIMBS = (
-    ((-0.028, 0.040, 0.0), (-0.030, -0.035, 0.0), 0.020, 0.017),
-    ((0.000, 0.040, 0.0), (0.000, -0.040, 0.0), 0.020, 0.017),
-    ((0.026, 0.035, 0.0), (0.030, -0.032, 0.0), 0.019, 0.015),
-    ((-0.032, -0.035, 0.0), (-0.044, -0.115, -0.01), 0.011, 0.007),
-    ((-0.010, -0.040, 0.0), (-0.012, -0.130, -0.01), 0.011, 0.007),
-    ((0.012, -0.040, 0.0), (0.016, -0.122, -0.01), 0.011, 0.007),
-    ((0.032, -0.032, 0.0), (0.044, -0.095, -0.01), 0.010, 0.006),
-    ((-0.035, 0.025, -0.005), (-0.085, -0.030, -0.02), 0.014, 0.009),
-)
 
 
 @dataclass(frozen=True)
@@ -46,99 +37,73 @@ class Scene:
     """The tensors ``rasterize`` takes, in its order."""
 
     means: Tensor
-    quats: Tensor
-    scales: Tensor
+    tangents: Tensor
     opacities: Tensor
     colors: Tensor
 
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        return self.means, self.quats, self.scales, self.opacities, self.colors
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.means, self.tangents, self.opacities, self.colors
 
 
-def _spread(area: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """``count`` points over limbs by ``area``: limb, position along it and around it (0..1), each [count]."""
-    edges = (area.cumsum(0) / area.sum() * count).round().long()
-    sizes = torch.diff(edges, prepend=torch.zeros(1, dtype=torch.long))
-    limb = torch.repeat_interleave(torch.arange(len(area)), sizes)
-    rank = torch.cat([torch.arange(int(n)) for n in sizes])
-    golden = 0.5 * (math.sqrt(5.0) - 1.0)
-    return limb, (rank + 0.5) / sizes[limb], (rank.double() * golden).remainder(1.0).float()
+def hand_scene(count: int, pose_name: str = "point", seed: int = 0) -> Scene:
+    """``count`` surfels in two layers on the posed hand, back of the hand towards -z, fingers up.
 
-
-def hand_scene(count: int, seed: int = 0) -> Scene:
-    """``count`` surfels in two layers on the closed surface: normals outwards, scales from the spacing."""
+    Each layer takes the surfels of an even choice of the refined mesh's faces, widened so that together they
+    have the area of all. The second layer lies up to 0.5 mm off and is a little tilted, as detached surfels
+    are.
+    """
     generator = torch.Generator().manual_seed(seed)
-
-    def rand(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
-
-    starts, ends = (torch.tensor([limb[i] for limb in _LIMBS]) for i in (0, 1))
-    radii = torch.tensor([[limb[2], limb[3]] for limb in _LIMBS])
-    lengths = (ends - starts).norm(dim=-1)
-    area = 2 * math.pi * radii.mean(-1) * (lengths + 2 * radii.mean(-1))
-    # Each layer is spread evenly (a golden-ratio lattice over each limb), in order along the limb.
-    layers = [_spread(area, count // 2), _spread(area, count - count // 2)]
-    limb, u, v = (torch.cat(parts) for parts in zip(*layers, strict=True))
-    axis = ((ends - starts) / lengths[:, None])[limb]
-    radius, length = radii[limb], lengths[limb]
-    # Along the axis from cap to cap; the radius closes like a sphere's beyond the ends.
-    along = u * (length + radius.sum(-1)) - radius[:, 0]
-    t = (along / length).clamp(0, 1)
-    base = radius[:, 0] + t * (radius[:, 1] - radius[:, 0])
-    beyond = (along - along.clamp(min=0.0).minimum(length)).clamp(-1, 1)
-    ring = (base**2 - beyond**2).clamp(min=1e-10).sqrt()
-    side = torch.linalg.cross(axis, torch.tensor([0.0, 0.0, 1.0]).expand(count, 3))
-    side = side / side.norm(dim=-1, keepdim=True)
-    angle = (v + 0.1 * rand(count)) * 2 * math.pi
-    radial = side * angle.cos()[:, None] + torch.linalg.cross(axis, side) * angle.sin()[:, None]
-    normal = (radial * ring[:, None] + axis * beyond[:, None]) / base[:, None]
-    normal = normal / normal.norm(dim=-1, keepdim=True)
-    layer = 0.0003 * (rand(count) - 0.5)
-    means = starts[limb] + axis * along[:, None] + radial * ring[:, None] + normal * layer[:, None]
-
-    # Rotation from z to the normal, then a random turn about it.
-    half = torch.cat([1 + normal[:, 2:], -normal[:, 1:2], normal[:, :1], torch.zeros(count, 1)], -1)
-    half = half + 1e-6 * torch.tensor([0.0, 1.0, 0.0, 0.0])
-    half = half / half.norm(dim=-1, keepdim=True)
-    turn = rand(count) * math.pi
-    c, s = turn.cos(), turn.sin()
-    w, x, y, _ = half.unbind(-1)
-    quats = torch.stack([w * c, x * c + y * s, y * c - x * s, w * s], -1)
-    spacing = math.sqrt(float(area.sum()) / (count / 2) * 0.6 / math.pi)
-    scales = 0.7 * spacing * (0.7 + 0.6 * rand(count, 2))
-    colors = torch.tensor([0.8, 0.6, 0.5]) * (0.6 + 0.4 * rand(count, 3))
-    return Scene(means, quats, scales, 0.5 + 0.49 * rand(count), colors)
+    model = load_builtin("right")
+    named = named_pose(pose_name, "right")
+    # Fingers up, back of the hand to the camera.
+    orient = torch.tensor([[1.2092, -1.2092, -1.2092]])
+    pose = HandPose(named.betas[None], orient, named.hand_pose[None], torch.zeros(1, 3), "right")
+    vertices = model.posed(pose).vertices[0]
+    half = count // 2
+    levels = next(level for level in range(4) if len(model.faces) * 4**level >= count - half)
+    surfels = MeshBinding.build(model, levels, 0).surfels(vertices)
+    parts = []
+    for layer, size in enumerate((half, count - half)):
+        every = len(surfels.means)
+        chosen = torch.randperm(every, generator=generator)[:size].sort().values
+        means, tangents, normals = (t[chosen] for t in (surfels.means, surfels.tangents, surfels.normals))
+        tangents = tangents * (every / size) ** 0.5
+        if layer == 1:
+            means = means + 0.0005 * (torch.rand(size, 1, generator=generator) - 0.5) * normals
+            slope = 0.3 * (torch.rand(size, 2, 1, generator=generator) - 0.5)
+            tangents = tangents + slope * tangents.norm(dim=-1, keepdim=True) * normals[:, None]
+        parts.append((means, tangents))
+    means, tangents = (torch.cat(x) for x in zip(*parts, strict=True))
+    colors = torch.tensor([0.8, 0.6, 0.5]) * (0.6 + 0.4 * torch.rand(count, 3, generator=generator))
+    return Scene(means, tangents, 0.5 + 0.49 * torch.rand(count, generator=generator), colors)
 
 
-def hand_camera(width: int, height: int) -> Camera:
-    """Half a metre away; the hand fills the shorter image side."""
-    focal = 0.5 / 0.2 * min(width, height)
+def hand_camera(scene: Scene, width: int, height: int) -> Camera:
+    """Half a metre in front of the hand, which fills nine tenths of the picture."""
+    low, high = scene.means.amin(0), scene.means.amax(0)
+    center, size = (low + high) / 2, high - low
+    distance = 0.5
+    focal = 0.9 * distance * min(width / float(size[0]), height / float(size[1]))
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     pose = torch.eye(4)
-    pose[:3, 3] = torch.tensor([0.012, 0.035, 0.5])
+    pose[:3, 3] = torch.tensor([0.0, 0.0, distance]) - center
     return Camera(K, pose, width, height)
 
 
 Step = Callable[[], RenderOutput]
 
 
-def forward_step(
-    scene: Scene, camera: Camera, options: RasterOptions, renderer: Renderer | None = None
-) -> Step:
-    """One forward pass as a function; ``renderer`` None takes the public way in."""
+def forward_step(scene: Scene, camera: Camera, options: RasterOptions) -> Step:
+    """One forward pass as a function."""
 
     def step() -> RenderOutput:
         with torch.no_grad():
-            if renderer is None:
-                return rasterize(*scene.tensors(), camera, options=options)
-            return cpu_backend.rasterize(*scene.tensors(), camera, options, renderer)
+            return rasterize(*scene.tensors(), camera, options=options)
 
     return step
 
 
-def training_step(
-    scene: Scene, camera: Camera, options: RasterOptions, renderer: Renderer | None = None
-) -> Step:
+def training_step(scene: Scene, camera: Camera, options: RasterOptions) -> Step:
     """Forward and backward: a gradient into every output, and out of every surfel input and the pose."""
     leaves = [t.clone().requires_grad_() for t in scene.tensors()]
     learned = Scene(*leaves)
@@ -147,10 +112,7 @@ def training_step(
     gradients: list[Tensor] = []
 
     def step() -> RenderOutput:
-        if renderer is None:
-            out = rasterize(*learned.tensors(), camera, options=options)
-        else:
-            out = cpu_backend.rasterize(*learned.tensors(), camera, options, renderer)
+        out = rasterize(*learned.tensors(), camera, options=options)
         images = [out.rgb, out.alpha, out.depth]
         if out.extras is not None:
             images += [out.median_depth, out.normal, out.distortion]
@@ -210,10 +172,10 @@ def _variants(scene: Scene, camera: Camera, args: argparse.Namespace) -> dict[st
         "fwd+bwd all": training_step(scene, camera, everything),
     }
     for name in args.instruction_sets:
-        options = RasterOptions(threads=1 if name == "scalar" else args.threads)
-        label = f"forward {name}" + (" 1 thread" if name == "scalar" else "")
-        steps[label] = forward_step(scene, camera, options, Renderer(name))
-        steps[label.replace("forward", "fwd+bwd")] = training_step(scene, camera, options, Renderer(name))
+        options = replace(color, instruction_set=name, threads=1 if name == "scalar" else args.threads)
+        label = name + (" 1 thread" if name == "scalar" else "")
+        steps[f"forward {label}"] = forward_step(scene, camera, options)
+        steps[f"fwd+bwd all {label}"] = training_step(scene, camera, replace(options, outputs="all"))
     return steps
 
 
@@ -236,7 +198,7 @@ def run(argv: Sequence[str]) -> int:
         scene = hand_scene(count)
         for size in args.sizes:
             width, height = (int(x) for x in size.split("x"))
-            camera = hand_camera(width, height)
+            camera = hand_camera(scene, width, height)
             steps = _variants(scene, camera, args)
             timings = measure(steps, args.seconds)
             if args.reference:

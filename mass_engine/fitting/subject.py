@@ -138,7 +138,6 @@ def draw(
     background: Tensor | None = None,
 ) -> RenderOutput:
     """Rasterise surfels [N] with ``opacities`` [N] and ``colors`` [N,3]."""
-    scales, quats = surfels.scales_quats()
     return rasterize(
-        surfels.means, quats, scales, opacities, colors, camera, background=background, options=options
+        surfels.means, surfels.tangents, opacities, colors, camera, background=background, options=options
     )

@@ -13,6 +13,8 @@ class Frame:
     def pairs(self) -> int: ...
     @property
     def bytes(self) -> int: ...
+    @property
+    def profile(self) -> dict[str, float]: ...
 
 class Renderer:
     def __init__(self, instruction_set: str = ...) -> None: ...
@@ -24,9 +26,11 @@ class Renderer:
         width: int,
         height: int,
         cull_backfaces: bool,
+        bounds: int,
+        center_depth: bool,
+        without: int,
         means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
+        tangents: Tensor,
         opacities: Tensor,
         colors: Tensor,
         rgb: Tensor,
@@ -44,8 +48,7 @@ class Renderer:
         self,
         frame: Frame,
         means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
+        tangents: Tensor,
         opacities: Tensor,
         colors: Tensor,
         alpha: Tensor,
@@ -57,8 +60,7 @@ class Renderer:
         d_normal: Tensor | None,
         d_distortion: Tensor | None,
         d_means: Tensor,
-        d_quats: Tensor,
-        d_scales: Tensor,
+        d_tangents: Tensor,
         d_opacities: Tensor,
         d_colors: Tensor,
         d_camera: Tensor,

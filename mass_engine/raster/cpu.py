@@ -13,20 +13,29 @@ from __future__ import annotations
 
 import functools
 import os
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
 from mass_engine.camera import Camera
-from mass_engine.errors import EngineError
+from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.raster import _kernels
-from mass_engine.raster.types import Extras, RasterOptions, RenderOutput
+from mass_engine.raster.types import OPTIMIZATIONS, Convention, Extras, RasterOptions, RenderOutput
 
 
 @functools.cache
 def shared_renderer(instruction_set: str = "auto") -> _kernels.Renderer:
-    """The process's renderer: its threads and its reusable buffers are made on first use."""
+    """The process's renderer: its threads and its reusable buffers are made on first use.
+
+    Raises ``BadArgumentError`` ``raster.instruction_set`` when this machine lacks it.
+    """
+    if instruction_set != "auto" and instruction_set not in _kernels.instruction_sets():
+        raise BadArgumentError(
+            "raster.instruction_set",
+            f"This machine has no {instruction_set}.",
+            f"Use auto, {', '.join(_kernels.instruction_sets())}.",
+        )
     return _kernels.Renderer(instruction_set)
 
 
@@ -37,42 +46,49 @@ def available_threads() -> int:
 
 def rasterize(
     means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
+    tangents: Tensor,
     opacities: Tensor,
     colors: Tensor,
     camera: Camera,
     options: RasterOptions,
-    renderer: _kernels.Renderer | None = None,
 ) -> RenderOutput:
     """As ``mass_engine.raster.rasterize``, in float32 and without background."""
-    renderer = renderer or shared_renderer()
-    given = (means, quats, scales, opacities, colors, camera.world_to_camera, camera.K)
+    given = (means, tangents, opacities, colors, camera.world_to_camera, camera.K)
     tensors = [t.to(torch.float32).contiguous() for t in given]
-    differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-    call = _Call(renderer, camera.width, camera.height, options, differentiable)
-    rgb, alpha, depth, *more = _Rasterize.apply(call, *tensors)  # type: ignore[no-untyped-call]
+    call = Call(camera.width, camera.height, options)
+    rgb, alpha, depth, *more = call.run(*tensors)
     extras = Extras(*more) if more else None
     return RenderOutput(rgb, alpha, depth, call.dropped, extras)
 
 
-class _Call:
-    """The arguments of one forward pass that are not tensors, and its count of dropped surfels."""
+class Call:
+    """One forward pass: its arguments that are not tensors, its count of dropped surfels, its frame.
+
+    ``frame`` (its profile, its memory) is set only with ``keep_frame``.
+    """
 
     def __init__(
         self,
-        renderer: _kernels.Renderer,
         width: int,
         height: int,
         options: RasterOptions,
-        differentiable: bool,
+        keep_frame: bool = False,
     ) -> None:
-        self.renderer = renderer
+        self.renderer = shared_renderer(options.instruction_set)
         self.width, self.height = width, height
         self.options = options
-        self.differentiable = differentiable
+        self.differentiable = False
+        self.keep_frame = keep_frame
+        self.frame: _kernels.Frame | None = None
         self.threads = options.threads or available_threads()
+        self.without = sum(1 << OPTIMIZATIONS.index(name) for name in options.without)
         self.dropped = 0
+
+    def run(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """Render float32, contiguous ``rasterize`` tensors and the camera's pose and K."""
+        self.differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+        images: tuple[Tensor, ...] = _Rasterize.apply(self, *tensors)  # type: ignore[no-untyped-call]
+        return images
 
 
 def _camera_numbers(world_to_camera: Tensor, K: Tensor, options: RasterOptions) -> list[float]:
@@ -87,7 +103,7 @@ def _camera_numbers(world_to_camera: Tensor, K: Tensor, options: RasterOptions) 
         *k[1][:2],
         k[0][2],
         k[1][2],
-        options.near,
+        options.near_plane,
         options.distortion_scale,
     ]
 
@@ -98,8 +114,8 @@ def _empty(*shape: int) -> Tensor:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, call: _Call, *tensors: Tensor) -> tuple[Tensor, ...]:
-        means, quats, scales, opacities, colors, pose, K = (t.detach() for t in tensors)
+    def forward(ctx: Any, call: Call, *tensors: Tensor) -> tuple[Tensor, ...]:
+        means, tangents, opacities, colors, pose, K = (t.detach() for t in tensors)
         H, W, options = call.height, call.width, call.options
         rgb, alpha, depth = _empty(H, W, 3), _empty(H, W), _empty(H, W)
         median = normal = distortion = weights = None
@@ -112,9 +128,11 @@ class _Rasterize(torch.autograd.Function):
                 W,
                 H,
                 options.cull_backfaces,
+                get_args(Convention).index(options.convention),
+                options.center_depth,
+                call.without,
                 means,
-                quats,
-                scales,
+                tangents,
                 opacities,
                 colors,
                 rgb,
@@ -134,6 +152,8 @@ class _Rasterize(torch.autograd.Function):
                 "Render smaller surfels or a smaller image.",
             ) from error
         call.dropped = frame.dropped
+        if call.keep_frame:
+            call.frame = frame
         if call.differentiable:
             ctx.call, ctx.frame = call, frame
             ctx.save_for_backward(*tensors, alpha, depth)
@@ -145,18 +165,17 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        means, quats, scales, opacities, colors, _, _, alpha, depth = (t.detach() for t in ctx.saved_tensors)
-        call: _Call = ctx.call
+        means, tangents, opacities, colors, pose, _, alpha, depth = (t.detach() for t in ctx.saved_tensors)
+        call: Call = ctx.call
         images = [None if g is None else g.contiguous() for g in gradients[:6]]
         d_rgb, d_alpha, d_depth, d_median, d_normal, d_distortion = images + [None] * (6 - len(images))
-        out = [torch.empty_like(t) for t in (means, quats, scales, opacities, colors)]
-        d_means, d_quats, d_scales, d_opacities, d_colors = out
-        d_camera = _empty(18)
+        out = [torch.empty_like(t) for t in (means, tangents, opacities, colors)]
+        d_means, d_tangents, d_opacities, d_colors = out
+        d_camera = _empty(21)
         call.renderer.backward(
             ctx.frame,
             means,
-            quats,
-            scales,
+            tangents,
             opacities,
             colors,
             alpha,
@@ -168,16 +187,17 @@ class _Rasterize(torch.autograd.Function):
             d_normal,
             d_distortion,
             d_means,
-            d_quats,
-            d_scales,
+            d_tangents,
             d_opacities,
             d_colors,
             d_camera,
             call.threads,
         )
         d_pose, d_K = d_camera.new_zeros(4, 4), d_camera.new_zeros(3, 3)
-        d_pose[:3, :3] = d_camera[:9].view(3, 3)
-        d_pose[:3, 3] = d_camera[9:12]
+        # The camera's centre, from which harmonics are seen, is -A^T t.
+        d_center = d_camera[18:21]
+        d_pose[:3, :3] = d_camera[:9].view(3, 3) - torch.outer(pose[:3, 3], d_center)
+        d_pose[:3, 3] = d_camera[9:12] - pose[:3, :3] @ d_center
         d_K[:2, :2] = d_camera[12:16].view(2, 2)
         d_K[:2, 2] = d_camera[16:18]
         return (None, *out, d_pose, d_K)

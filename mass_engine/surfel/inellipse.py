@@ -85,6 +85,21 @@ def principal_scales_quats(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
     return scales, quats
 
 
+def principal_tangents(scales: Tensor, quats: Tensor) -> Tensor:
+    """Standard deviations [...,2] along the first two axes of quats [...,4] -> tangents [...,2,3].
+
+    Quaternions are wxyz of any length. A scale that is not positive or a quaternion without length gives NaN,
+    which the rasteriser drops and counts; no gradient passes there.
+    """
+    finite = torch.cat([scales, quats], -1).isfinite().all(-1)
+    usable = finite & (scales > 0).all(-1) & (quats.square().sum(-1) > 1e-24)
+    unit = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
+    quats = torch.where(usable.unsqueeze(-1), quats, unit)
+    scales = torch.where(usable.unsqueeze(-1), scales, torch.full_like(scales, torch.nan))
+    rotation = quat_to_matrix(quats / quats.norm(dim=-1, keepdim=True))
+    return rotation[..., :2].mT * scales.unsqueeze(-1)
+
+
 def safe_norm(vectors: Tensor) -> Tensor:
     """Length [...] of vectors [...,3]; at zero it is tiny instead of having no gradient."""
     return ((vectors * vectors).sum(-1) + 1e-24).sqrt()

@@ -96,11 +96,13 @@ void Binning::assign(const CameraData& camera, const Box* boxes, const uint32_t*
     if (slot_begin) slot_begin[count] = pair_count_;
 }
 
-void Binning::sort(int tile) {
+void Binning::sort(int tile, bool by_comparison) {
     const uint32_t begin = tile_begin_.data()[tile], n = tile_begin_.data()[tile + 1] - begin;
     uint64_t *from = items_.data() + begin, *to = swap_.data() + begin;
     uint32_t* out = surfel_.data() + begin;
-    if (n <= kInsertion) {
+    if (by_comparison) {
+        std::sort(from, from + n);
+    } else if (n <= kInsertion) {
         for (uint32_t i = 1; i < n; ++i) {
             const uint64_t item = from[i];
             uint32_t j = i;

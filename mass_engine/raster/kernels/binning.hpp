@@ -23,7 +23,7 @@ public:
                 ThreadPool& pool, int threads);
 
     // Orders one tile's list by key, then index. Tiles are independent of each other.
-    void sort(int tile);
+    void sort(int tile, bool by_comparison);
 
     PairData pairs() const;
     uint32_t pair_count() const { return pair_count_; }

@@ -64,12 +64,12 @@ MASS_INLINE void accumulate_extra(const Splat& s, const Normal& normal, const Sa
 template <bool kExtra, bool kWeights, bool kLowPassOnly>
 MASS_INLINE F blend_blocks(const CameraData& camera, const Splat& s, const Normal* normal, const TilePixels& pixels, float rank,
                            unsigned todo, unsigned& live, TileForward& t, TileForwardExtra& e) {
-    const F pz_max = largest_pz(camera, s);
+    const SplatLimits limits = limits_of(camera, s);
     F sum_of_weights = splat(0.0f);
     do {
         const int block = __builtin_ctz(todo);
         todo &= todo - 1;
-        const Sample p = sample<kLowPassOnly>(s, load(pixels.x[block % 4]), load(pixels.y[block / 4]), pz_max);
+        const Sample p = sample<kLowPassOnly>(s, limits, load(pixels.x[block % 4]), load(pixels.y[block / 4]));
         const F before = load(t.transmittance[block]);
         const F after = fnma(before, p.alpha, before);
         const M blended = both(p.valid, le(splat(kTransmittanceStop), after));
@@ -88,7 +88,7 @@ MASS_INLINE F blend_blocks(const CameraData& camera, const Splat& s, const Norma
         if (any(ended)) {
             store(t.stop[block], select(ended, splat(rank), load(t.stop[block])));
             kept = select(ended, neg(before), kept);
-            if (!any(lt(splat(0.0f), kept))) live &= ~(1u << block);
+            if (!any(lt(splat(0.0f), kept)) && !(camera.without & kWithoutEarlyStop)) live &= ~(1u << block);
         }
         store(t.transmittance[block], kept);
     } while (todo != 0);
@@ -96,7 +96,7 @@ MASS_INLINE F blend_blocks(const CameraData& camera, const Splat& s, const Norma
 }
 
 template <bool kExtra, bool kWeights>
-static void blend_tile(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& out,
+static int64_t blend_tile(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& out,
                        const PixelState& state, float* slot_weights, int tile) {
     const TileWindow window = tile_window(camera, tile);
     const uint32_t begin = pairs.tile_begin[tile], end = pairs.tile_begin[tile + 1];
@@ -109,6 +109,7 @@ static void blend_tile(const CameraData& camera, const ProjectedData& in, const 
     }
     TilePixels pixels;
     tile_pixels(window.x / kTile, window.y / kTile, pixels);
+    int64_t blocks = 0;
 
     for (uint32_t k = begin; k < end && live != 0; ++k) {
         const uint32_t ahead = pairs.surfel[k + 8 < end ? k + 8 : k];
@@ -116,8 +117,9 @@ static void blend_tile(const CameraData& camera, const ProjectedData& in, const 
         if constexpr (kExtra) __builtin_prefetch(&in.normals[ahead]);
         const uint32_t id = pairs.surfel[k];
         const Splat& s = in.splats[id];
-        const unsigned todo = block_mask(s.box, window) & live;
+        const unsigned todo = (camera.without & kWithoutBlocks ? kAllBlocks : block_mask(s.box, window)) & live;
         if (todo == 0) continue;
+        blocks += __builtin_popcount(todo);
         const Normal* normal = kExtra ? in.normals + id : nullptr;
         const float rank = static_cast<float>(k - begin);
         const F weights = s.low_pass_only != 0.0f
@@ -156,6 +158,7 @@ static void blend_tile(const CameraData& camera, const ProjectedData& in, const 
             write_tile(camera, window, &e.m2[0][0], state.moments, 3, 2);
         }
     }
+    return blocks;
 }
 
 // An empty tile is zeros; most tiles around a hand are.
@@ -167,9 +170,9 @@ static void clear_tile(const CameraData& camera, const TileWindow& w, float* ima
     }
 }
 
-void blend(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& out,
-           const PixelState& state, float* slot_weights, int tile) {
-    if (pairs.tile_begin[tile] == pairs.tile_begin[tile + 1]) {
+int64_t blend(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& out,
+              const PixelState& state, float* slot_weights, int tile) {
+    if (pairs.tile_begin[tile] == pairs.tile_begin[tile + 1] && !(camera.without & kWithoutEmptyTiles)) {
         const TileWindow w = tile_window(camera, tile);
         clear_tile(camera, w, out.rgb, 3);
         clear_tile(camera, w, out.alpha, 1);
@@ -177,19 +180,14 @@ void blend(const CameraData& camera, const ProjectedData& in, const PairData& pa
         clear_tile(camera, w, out.median, 1);
         clear_tile(camera, w, out.normal, 3);
         clear_tile(camera, w, out.distortion, 1);
-        return;  // the backward pass skips empty tiles: their pixel state is never read
+        return 0;  // the backward pass skips empty tiles: their pixel state is never read
     }
     if (out.normal) {
-        if (slot_weights) {
-            blend_tile<true, true>(camera, in, pairs, out, state, slot_weights, tile);
-        } else {
-            blend_tile<true, false>(camera, in, pairs, out, state, slot_weights, tile);
-        }
-    } else if (slot_weights) {
-        blend_tile<false, true>(camera, in, pairs, out, state, slot_weights, tile);
-    } else {
-        blend_tile<false, false>(camera, in, pairs, out, state, slot_weights, tile);
+        return slot_weights ? blend_tile<true, true>(camera, in, pairs, out, state, slot_weights, tile)
+                            : blend_tile<true, false>(camera, in, pairs, out, state, slot_weights, tile);
     }
+    return slot_weights ? blend_tile<false, true>(camera, in, pairs, out, state, slot_weights, tile)
+                        : blend_tile<false, false>(camera, in, pairs, out, state, slot_weights, tile);
 }
 
 }  // namespace mass::MASS_ISA

@@ -123,8 +123,9 @@ MASS_INLINE void differentiate_block(const CameraData& camera, const Splat& s, c
         const F twice = keep(solid, mul(add(d_rho3, d_rho3), mul(p.inverse_pz, p.inverse_pz)));
         const F d_pu = keep(solid, mul(twice, p.pu)), d_pv = keep(solid, mul(twice, p.pv));
         // pz enters rho3 and the depth through its inverse, and q = pz / zc directly.
-        F d_pz = fma(add(d_rho3, d_rho3), p.rho, mul(d_depth, depth));
-        if constexpr (kExtra) d_pz = fnma(d_q, q, d_pz);
+        F through_depth = mul(d_depth, depth);
+        if constexpr (kExtra) through_depth = fnma(d_q, q, through_depth);
+        F d_pz = fma(add(d_rho3, d_rho3), p.rho, keep(p.inclined, through_depth));
         d_pz = neg(keep(solid, mul(d_pz, p.inverse_pz)));
         sums[4] = fma(d_pu, p.dx, sums[4]);
         sums[5] = fma(d_pu, p.dy, sums[5]);
@@ -134,7 +135,7 @@ MASS_INLINE void differentiate_block(const CameraData& camera, const Splat& s, c
         sums[9] = fma(d_pz, p.dy, sums[9]);
         sums[11] = fnma(d_pu, splat(s.a1), fnma(d_pv, splat(s.b1), fnma(d_pz, splat(s.g1), sums[11])));
         sums[12] = fnma(d_pu, splat(s.a2), fnma(d_pv, splat(s.b2), fnma(d_pz, splat(s.g2), sums[12])));
-        d_zc = mul(d_depth, select(p.solid, p.inverse_pz, one));
+        d_zc = mul(d_depth, select(p.inclined, p.inverse_pz, one));
     }
     if constexpr (kExtra) d_zc = fnma(mul(d_q, q), splat(1.0f / s.zc), d_zc);
     const F push = mul(d_rho2, splat(-2.0f * kLowPass));
@@ -146,20 +147,20 @@ MASS_INLINE void differentiate_block(const CameraData& camera, const Splat& s, c
 template <bool kExtra, bool kLowPassOnly>
 MASS_INLINE void differentiate_blocks(const CameraData& camera, const Splat& s, const Normal* normal, const TilePixels& pixels,
                                       float rank, unsigned todo, TileBackward& t, const TileBackwardExtra& e, PairGradient& out) {
-    const F pz_max = largest_pz(camera, s);
+    const SplatLimits limits = limits_of(camera, s);
     F sums[16];
     for (F& x : sums) x = splat(0.0f);
     do {
         const int block = __builtin_ctz(todo);
         todo &= todo - 1;
-        const Sample p = sample<kLowPassOnly>(s, load(pixels.x[block % 4]), load(pixels.y[block / 4]), pz_max);
+        const Sample p = sample<kLowPassOnly>(s, limits, load(pixels.x[block % 4]), load(pixels.y[block / 4]));
         differentiate_block<kExtra, kLowPassOnly>(camera, s, normal, p, splat(rank), block, t, e, sums);
     } while (todo != 0);
     sum16(sums, &out.r);
 }
 
 template <bool kExtra>
-static void blend_backward_tile(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& image,
+static int64_t blend_backward_tile(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& image,
                                 const PixelState& state, const ImageGradient& gradient, const PairSums& out, int tile) {
     const TileWindow window = tile_window(camera, tile);
     const uint32_t begin = pairs.tile_begin[tile];
@@ -171,6 +172,7 @@ static void blend_backward_tile(const CameraData& camera, const ProjectedData& i
     TilePixels pixels;
     tile_pixels(window.x / kTile, window.y / kTile, pixels);
 
+    int64_t blocks = 0;
     unsigned live = 0;
     int next_change = last;  // the largest stop among blocks that are not live yet
     for (int rank = last - 1; rank >= 0; --rank) {
@@ -187,8 +189,9 @@ static void blend_backward_tile(const CameraData& camera, const ProjectedData& i
         if constexpr (kExtra) __builtin_prefetch(&in.normals[ahead]);
         const uint32_t id = pairs.surfel[k];
         const Splat& s = in.splats[id];
-        const unsigned todo = block_mask(s.box, window) & live;
+        const unsigned todo = (camera.without & kWithoutBlocks ? kAllBlocks : block_mask(s.box, window)) & live;
         if (todo == 0) continue;
+        blocks += __builtin_popcount(todo);
         const Normal* normal = kExtra ? in.normals + id : nullptr;
         const uint32_t slot = slot_of(pairs, id, s.box, window);
         out.touched[slot] = 1;
@@ -198,16 +201,14 @@ static void blend_backward_tile(const CameraData& camera, const ProjectedData& i
             differentiate_blocks<kExtra, false>(camera, s, normal, pixels, static_cast<float>(rank), todo, t, e, out.gradient[slot]);
         }
     }
+    return blocks;
 }
 
-void blend_backward(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& image,
-                    const PixelState& state, const ImageGradient& gradient, const PairSums& out, int tile) {
-    if (pairs.tile_begin[tile] == pairs.tile_begin[tile + 1]) return;
-    if (out.extra) {
-        blend_backward_tile<true>(camera, in, pairs, image, state, gradient, out, tile);
-    } else {
-        blend_backward_tile<false>(camera, in, pairs, image, state, gradient, out, tile);
-    }
+int64_t blend_backward(const CameraData& camera, const ProjectedData& in, const PairData& pairs, const ImageData& image,
+                       const PixelState& state, const ImageGradient& gradient, const PairSums& out, int tile) {
+    if (pairs.tile_begin[tile] == pairs.tile_begin[tile + 1]) return 0;
+    return out.extra ? blend_backward_tile<true>(camera, in, pairs, image, state, gradient, out, tile)
+                     : blend_backward_tile<false>(camera, in, pairs, image, state, gradient, out, tile);
 }
 
 }  // namespace mass::MASS_ISA

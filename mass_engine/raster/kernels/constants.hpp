@@ -15,6 +15,12 @@ inline constexpr float kLowPass = 2.0f;
 inline constexpr float kMedianTransmittance = 0.5f;
 // Below this |cosine| between the normal and the viewing ray the disk is edge-on: only its low-pass part is drawn.
 inline constexpr float kEdgeOnCosine = 1e-4f;
+// A surfel whose tangents are parallel (squared sine) or too short (squared length of their product) is dropped.
+inline constexpr float kLeastSine2 = 1e-12f;
+inline constexpr float kLeastArea2 = 1e-37f;
+// The bounds of other renderers (Bounds in types.hpp), in standard deviations; theirs is a low-pass of sqrt(1/2) px.
+inline constexpr float kInriaReach = 3.0f;
+inline constexpr float kGsplatReach = 3.33f;
 // Layout, without influence on the result: a tile is 4 x 4 blocks, a block is 4 x 4 pixels and one vector.
 inline constexpr int kLanes = 16;
 inline constexpr int kBlock = 4;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "geometry.hpp"
+#include "harmonics.hpp"
 #include "reduce.hpp"
 
 namespace mass::MASS_ISA {
@@ -32,16 +33,129 @@ MASS_INLINE M low_pass_only(const Geometry& g, F reach, M crossing) {
     return either(andnot(narrow, crossing), g.edge_on);
 }
 
+// The smallest rectangle around the projected ellipse rho3 <= rho (2DGS supplement), relative to the projected centre:
+// its middle (ex, ey) and the squares of its half sides. Nonsense when the disk crosses the camera plane.
+struct Extent {
+    F ex, ey, hx2, hy2;
+};
+
+MASS_INLINE Extent extent(const CameraData& camera, const Geometry& g, F rho) {
+    const F k00 = splat(camera.K2[0]), k01 = splat(camera.K2[1]);
+    const F k10 = splat(camera.K2[2]), k11 = splat(camera.K2[3]);
+    const F zc = g.c[2], spread = fma(g.u[2], g.u[2], mul(g.v[2], g.v[2]));
+    const F f = div(rho, fnma(rho, spread, mul(zc, zc)));  // -c^2 / d
+    const F tx0 = fma(k00, g.jn00, mul(k01, g.jn10)), tx1 = fma(k00, g.jn01, mul(k01, g.jn11));
+    const F ty0 = fma(k10, g.jn00, mul(k11, g.jn10)), ty1 = fma(k10, g.jn01, mul(k11, g.jn11));
+    Extent o;
+    o.ex = neg(mul(f, fma(tx0, g.u[2], mul(tx1, g.v[2]))));
+    o.ey = neg(mul(f, fma(ty0, g.u[2], mul(ty1, g.v[2]))));
+    o.hx2 = fma(o.ex, o.ex, mul(f, fma(tx0, tx0, mul(tx1, tx1))));
+    o.hy2 = fma(o.ey, o.ey, mul(f, fma(ty0, ty0, mul(ty1, ty1))));
+    return o;
+}
+
+struct PixelBounds {
+    F x0, x1, y0, y1;  // inclusive
+    M crossing;        // the disk crosses the near plane, its image is unbounded
+};
+
+// Where the surfel may reach the alpha cut: the ellipse and the low-pass disk of radius `reach`.
+MASS_INLINE PixelBounds exact_bounds(const CameraData& camera, const Geometry& g, F rho_cut, F reach) {
+    const F zero = splat(0.0f), half = splat(0.5f), zc = g.c[2], near_z = splat(camera.near_z);
+    const F spread = fma(g.u[2], g.u[2], mul(g.v[2], g.v[2])), gap = sub(zc, near_z);
+    const M all = le(zero, zero);
+    PixelBounds o;
+    o.crossing = andnot(andnot(all, lt(mul(rho_cut, spread), mul(gap, gap))), g.edge_on);
+    const Extent e = extent(camera, g, rho_cut);
+    const F hx = sqrt(e.hx2), hy = sqrt(e.hy2);
+    const F margin = splat(kBoundsMargin), slack = splat(1.0001f);
+    const F wide_x = mul(slack, add(hx, abs(mul(e.ex, splat(1e-4f)))));
+    const F wide_y = mul(slack, add(hy, abs(mul(e.ey, splat(1e-4f)))));
+    // Edge-on: no ellipse. max and min return the second operand when the first is NaN.
+    const F left = select(g.edge_on, zero, sub(e.ex, wide_x)), right = select(g.edge_on, zero, add(e.ex, wide_x));
+    const F top = select(g.edge_on, zero, sub(e.ey, wide_y)), bottom = select(g.edge_on, zero, add(e.ey, wide_y));
+    const F low = sub(g.mx, add(half, margin)), high = add(sub(g.mx, half), margin);
+    const F lowy = sub(g.my, add(half, margin)), highy = add(sub(g.my, half), margin);
+    const F width = splat(static_cast<float>(camera.width - 1)), height = splat(static_cast<float>(camera.height - 1));
+    o.x0 = select(o.crossing, zero, max(ceil(add(low, min(left, neg(reach)))), zero));
+    o.x1 = select(o.crossing, width, min(floor(add(high, max(right, reach))), width));
+    o.y0 = select(o.crossing, zero, max(ceil(add(lowy, min(top, neg(reach)))), zero));
+    o.y1 = select(o.crossing, height, min(floor(add(highy, max(bottom, reach))), height));
+    return o;
+}
+
+// Whole tiles around a box of a fixed number of standard deviations whatever the opacity, as the public renderers
+// have it: hbb1/diff-surfel-rasterization a square about the middle of the three-sigma ellipse, with a low-pass reach
+// of 3 sqrt(1/2) px; gsplat 3.33 times the one-sigma box, without a low-pass reach.
+MASS_INLINE PixelBounds tile_bounds(const CameraData& camera, const Geometry& g) {
+    const bool inria = camera.bounds == Bounds::kInria;
+    const F least = splat(1e-4f), tile = splat(static_cast<float>(kTile)), inverse_tile = splat(1.0f / kTile);
+    const F zero = splat(0.0f), one = splat(1.0f);
+    const Extent e = extent(camera, g, splat(inria ? kInriaReach * kInriaReach : 1.0f));
+    F rx = sqrt(max(e.hx2, least)), ry = sqrt(max(e.hy2, least));
+    F middle_x = add(g.mx, e.ex), middle_y = add(g.my, e.ey);
+    if (inria) {  // its pixel centres are whole numbers
+        rx = ceil(max(max(rx, ry), splat(kInriaReach * 0.70710678f)));
+        ry = rx;
+        middle_x = sub(middle_x, splat(0.5f));
+        middle_y = sub(middle_y, splat(0.5f));
+    } else {
+        rx = ceil(mul(splat(kGsplatReach), rx));
+        ry = ceil(mul(splat(kGsplatReach), ry));
+    }
+    const F width = splat(static_cast<float>(camera.width - 1)), height = splat(static_cast<float>(camera.height - 1));
+    PixelBounds o;
+    o.crossing = lt(one, zero);
+    o.x0 = mul(max(floor(mul(sub(middle_x, rx), inverse_tile)), zero), tile);
+    o.y0 = mul(max(floor(mul(sub(middle_y, ry), inverse_tile)), zero), tile);
+    const F far_x = add(middle_x, rx), far_y = add(middle_y, ry);
+    F end_x, end_y;
+    if (inria) {
+        const F nearly_tile = splat(static_cast<float>(kTile - 1));
+        end_x = floor(mul(add(far_x, nearly_tile), inverse_tile));
+        end_y = floor(mul(add(far_y, nearly_tile), inverse_tile));
+    } else {
+        end_x = ceil(mul(far_x, inverse_tile));
+        end_y = ceil(mul(far_y, inverse_tile));
+    }
+    o.x1 = min(sub(mul(end_x, tile), one), width);
+    o.y1 = min(sub(mul(end_y, tile), one), height);
+    return o;
+}
+
+// The clamped colours of surfels first .. first + 15, or NaN where a coefficient is no number.
+MASS_INLINE void harmonic_colors(const CameraData& camera, const SurfelData& in, int64_t first, const int* ids,
+                                 SurfelLanes& s, F* clamped) {
+    const int K = in.coefficients;
+    F Y[16], d[3], h[48];
+    view_direction(camera, s.mean, d);
+    harmonic_basis(d, K, Y);
+    if (ids) {
+        alignas(64) float lanes[48][kLanes];
+        for (int l = 0; l < kLanes; ++l) {
+            const float* from = in.harmonics + static_cast<int64_t>(ids[l]) * 3 * K;
+            for (int k = 0; k < 3 * K; ++k) lanes[k][l] = from[k];
+        }
+        for (int k = 0; k < 3 * K; ++k) h[k] = load(lanes[k]);
+    } else {
+        for (int k = 0; k < 3 * K; ++k) h[k] = gather(in.harmonics + first * 3 * K + k, 3 * K);
+    }
+    harmonic_color(Y, h, K, s.color);
+    for (int c = 0; c < 3; ++c) clamped[c] = max(s.color[c], splat(0.0f));
+}
+
 int project(const CameraData& camera, const SurfelData& in, const ProjectedData& out, int begin, int end) {
     int dropped = 0;
-    const F zero = splat(0.0f), half = splat(0.5f), near_z = splat(camera.near_z);
-    const M all = le(zero, zero);
+    const F zero = splat(0.0f), near_z = splat(camera.near_z);
     for (int first = begin; first < end; first += kLanes) {
         const int lanes = end - first < kLanes ? end - first : kLanes;
         int ids[kLanes];
         for (int l = 0; l < kLanes; ++l) ids[l] = first + (l < lanes ? l : 0);
+        const bool whole = lanes == kLanes;
         if (first + 9 * kLanes <= in.count) prefetch_run(in, first + 8 * kLanes);
-        const SurfelLanes s = lanes == kLanes ? load_run(in, first) : load_lanes(in, ids);
+        SurfelLanes s = whole ? load_run(in, first) : load_lanes(in, ids);
+        F color[3] = {s.color[0], s.color[1], s.color[2]};
+        if (in.harmonics) harmonic_colors(camera, in, first, whole ? nullptr : ids, s, color);
         const Geometry g = make_geometry(camera, s);
         const F zc = g.c[2];
 
@@ -50,36 +164,11 @@ int project(const CameraData& camera, const SurfelData& in, const ProjectedData&
         if (camera.cull_backfaces) seen = both(seen, le(g.facing, zero));
 
         // rho at the alpha cut, a little generous.
-        const F rho_cut = max(fma(splat(2.0f), log_rough(mul(splat(255.0f), s.opacity)), splat(2e-3f)), splat(2e-3f));
+        const F strongest = camera.without & kWithoutTightBounds ? max(s.opacity, splat(1.0f)) : s.opacity;
+        const F rho_cut = max(fma(splat(2.0f), log_rough(mul(splat(255.0f), strongest)), splat(2e-3f)), splat(2e-3f));
         const F reach = sqrt(mul(rho_cut, splat(1.0f / kLowPass)));
-        // Bounds of the projected ellipse rho3 <= rho_cut (2DGS supplement), relative to the centre. When the disk
-        // crosses the near plane its image is unbounded.
-        const F su = s.scale[0], sv = s.scale[1];
-        const F tz0 = mul(su, g.u[2]), tz1 = mul(sv, g.v[2]);
-        const F spread = fma(tz0, tz0, mul(tz1, tz1));
-        const M crossing = andnot(andnot(all, lt(mul(rho_cut, spread), mul(sub(zc, near_z), sub(zc, near_z)))), g.edge_on);
-        const F f = div(rho_cut, fnma(rho_cut, spread, mul(zc, zc)));  // -c^2 / d
-        const F k00 = splat(camera.K2[0]), k01 = splat(camera.K2[1]), k10 = splat(camera.K2[2]), k11 = splat(camera.K2[3]);
-        const F tx0 = mul(su, fma(k00, g.jn00, mul(k01, g.jn10))), tx1 = mul(sv, fma(k00, g.jn01, mul(k01, g.jn11)));
-        const F ty0 = mul(su, fma(k10, g.jn00, mul(k11, g.jn10))), ty1 = mul(sv, fma(k10, g.jn01, mul(k11, g.jn11)));
-        const F ex = neg(mul(f, fma(tx0, tz0, mul(tx1, tz1)))), ey = neg(mul(f, fma(ty0, tz0, mul(ty1, tz1))));
-        const F hx = sqrt(fma(ex, ex, mul(f, fma(tx0, tx0, mul(tx1, tx1)))));
-        const F hy = sqrt(fma(ey, ey, mul(f, fma(ty0, ty0, mul(ty1, ty1)))));
-        const F margin = splat(kBoundsMargin), slack = splat(1.0001f);
-        const F wide_x = mul(slack, add(hx, abs(mul(ex, splat(1e-4f))))), wide_y = mul(slack, add(hy, abs(mul(ey, splat(1e-4f)))));
-        // Edge-on: no ellipse. max and min return the second operand when the first is NaN.
-        const F left = select(g.edge_on, zero, sub(ex, wide_x)), right = select(g.edge_on, zero, add(ex, wide_x));
-        const F top = select(g.edge_on, zero, sub(ey, wide_y)), bottom = select(g.edge_on, zero, add(ey, wide_y));
-        const F low = sub(g.mx, add(half, margin)), high = add(sub(g.mx, half), margin);
-        const F lowy = sub(g.my, add(half, margin)), highy = add(sub(g.my, half), margin);
-        const F width = splat(static_cast<float>(camera.width - 1)), height = splat(static_cast<float>(camera.height - 1));
-        F x0 = max(ceil(add(low, min(left, neg(reach)))), zero), x1 = min(floor(add(high, max(right, reach))), width);
-        F y0 = max(ceil(add(lowy, min(top, neg(reach)))), zero), y1 = min(floor(add(highy, max(bottom, reach))), height);
-        x0 = select(crossing, zero, x0);
-        y0 = select(crossing, zero, y0);
-        x1 = select(crossing, width, x1);
-        y1 = select(crossing, height, y1);
-        seen = andnot(both(seen, both(le(x0, x1), le(y0, y1))), g.bad);
+        const PixelBounds b = camera.bounds == Bounds::kExact ? exact_bounds(camera, g, rho_cut, reach) : tile_bounds(camera, g);
+        seen = andnot(both(seen, both(le(b.x0, b.x1), le(b.y0, b.y1))), g.bad);
 
         const unsigned exists = (1u << lanes) - 1u;
         const unsigned bad = bits(g.bad) & exists;
@@ -90,10 +179,10 @@ int project(const CameraData& camera, const SurfelData& in, const ProjectedData&
         alignas(64) Box box[kLanes];
         alignas(64) float box_low[kLanes], box_high[kLanes];
         store(depth, zc);
-        store(bounds[0], x0);
-        store(bounds[1], x1);
-        store(bounds[2], y0);
-        store(bounds[3], y1);
+        store(bounds[0], b.x0);
+        store(bounds[1], b.x1);
+        store(bounds[2], b.y0);
+        store(bounds[3], b.y1);
         for (int l = 0; l < kLanes; ++l) {
             const bool shown = visible >> l & 1u;
             box[l] = {static_cast<int16_t>(shown ? bounds[0][l] : 0), static_cast<int16_t>(shown ? bounds[1][l] : -1),
@@ -105,13 +194,15 @@ int project(const CameraData& camera, const SurfelData& in, const ProjectedData&
         __builtin_memcpy(out.keys + first, depth, sizeof(float) * static_cast<size_t>(lanes));
         if (visible == 0) continue;
 
-        F rows[kLanes] = {g.mx, g.my, g.a1, g.a2, g.b1, g.b2, g.g1, g.g2, zc, s.opacity, s.color[0], s.color[1], s.color[2],
-                          keep(low_pass_only(g, reach, crossing), splat(1.0f)), load(box_low), load(box_high)};
+        const M narrow = camera.without & kWithoutShortPath ? g.edge_on : low_pass_only(g, reach, b.crossing);
+        F rows[kLanes] = {g.mx, g.my, g.a1, g.a2, g.b1, g.b2, g.g1, g.g2, zc, s.opacity, color[0], color[1], color[2],
+                          keep(narrow, splat(1.0f)), load(box_low), load(box_high)};
         transpose16(rows);
         for (int l = 0; l < lanes; ++l) store(&out.splats[first + l].mx, rows[l]);
         if (out.normals) {
-            const F sign = select(lt(zero, g.facing), splat(-1.0f), splat(1.0f));
-            for (int k = 0; k < 3; ++k) store(normal[k], mul(sign, g.n[k]));
+            const F length = sqrt(g.normal2);
+            const F scale = div(select(lt(zero, g.facing), splat(-1.0f), splat(1.0f)), length);
+            for (int k = 0; k < 3; ++k) store(normal[k], mul(scale, g.n[k]));
             for (int l = 0; l < lanes; ++l) out.normals[first + l] = {normal[0][l], normal[1][l], normal[2][l], 0.0f};
         }
     }

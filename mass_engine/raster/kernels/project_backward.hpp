@@ -2,6 +2,7 @@
 #pragma once
 
 #include "geometry.hpp"
+#include "harmonics.hpp"
 #include "reduce.hpp"
 
 namespace mass::MASS_ISA {
@@ -28,7 +29,7 @@ MASS_INLINE bool collect(const PairSums& in, uint32_t begin, uint32_t end, float
 }
 
 struct CameraSums {
-    F A[9], t[3], K2[4], k[2];
+    F A[9], t[3], K2[4], k[2], center[3];
 };
 
 MASS_INLINE void add_outer(F* A, const F* y, const F* x) {  // A += y x^T
@@ -38,37 +39,36 @@ MASS_INLINE void add_outer(F* A, const F* y, const F* x) {  // A += y x^T
 }
 
 struct LaneGradient {
-    float mean[3][kLanes], quat[4][kLanes], scale[2][kLanes], opacity[kLanes], color[3][kLanes];
+    alignas(64) float mean[3][kLanes], tangent[6][kLanes], opacity[kLanes], color[3][kLanes], harmonics[48][kLanes];
 };
 
 // The chain rule through make_geometry, in reverse order.
 MASS_INLINE void differentiate(const CameraData& camera, const SurfelLanes& s, const Geometry& g, const PixelSums& p,
-                               M exists, CameraSums& sums, LaneGradient& out) {
+                               M exists, CameraSums& sums, F* d_mean, F* d_tangent) {
     const F zero = splat(0.0f);
-    const M all = le(zero, zero);
-    const M solid = andnot(all, g.edge_on);
+    const M solid = andnot(exists, g.edge_on);
     const F zc = g.c[2], inverse_z = div(splat(1.0f), zc);
 
-    // a = zc G0 / su, b = zc G1 / sv, g = -(z0 G0 + z1 G1)
-    const F iu = div(splat(1.0f), s.scale[0]), iv = div(splat(1.0f), s.scale[1]);
-    const F ku = mul(zc, iu), kv = mul(zc, iv);
-    const F d_su = neg(mul(iu, keep(solid, fma(p.a1, g.a1, mul(p.a2, g.a2)))));
-    const F d_sv = neg(mul(iv, keep(solid, fma(p.b1, g.b1, mul(p.b2, g.b2)))));
-    const F dG00 = fnma(g.u[2], p.g1, mul(ku, p.a1)), dG01 = fnma(g.u[2], p.g2, mul(ku, p.a2));
-    const F dG10 = fnma(g.v[2], p.g1, mul(kv, p.b1)), dG11 = fnma(g.v[2], p.g2, mul(kv, p.b2));
+    // a = zc G0, b = zc G1, g = -(z0 G0 + z1 G1)
+    const F dG00 = fnma(g.u[2], p.g1, mul(zc, p.a1)), dG01 = fnma(g.u[2], p.g2, mul(zc, p.a2));
+    const F dG10 = fnma(g.v[2], p.g1, mul(zc, p.b1)), dG11 = fnma(g.v[2], p.g2, mul(zc, p.b2));
     F du[3], dv[3], dc[3];
     du[2] = neg(keep(solid, fma(g.G00, p.g1, mul(g.G01, p.g2))));
     dv[2] = neg(keep(solid, fma(g.G10, p.g1, mul(g.G11, p.g2))));
-    dc[2] = add(p.zc, mul(inverse_z, keep(solid, fma(p.a1, g.a1, fma(p.a2, g.a2, fma(p.b1, g.b1, mul(p.b2, g.b2)))))));
+    const F d_factor = fma(p.a1, g.G00, fma(p.a2, g.G01, fma(p.b1, g.G10, mul(p.b2, g.G11))));
+    dc[2] = add(p.zc, keep(solid, d_factor));
 
     // dJ = -G^T dG G^T
     const F P00 = fma(dG00, g.G00, mul(dG01, g.G01)), P01 = fma(dG00, g.G10, mul(dG01, g.G11));
     const F P10 = fma(dG10, g.G00, mul(dG11, g.G01)), P11 = fma(dG10, g.G10, mul(dG11, g.G11));
-    const F dJ00 = neg(keep(solid, fma(g.G00, P00, mul(g.G10, P10)))), dJ01 = neg(keep(solid, fma(g.G00, P01, mul(g.G10, P11))));
-    const F dJ10 = neg(keep(solid, fma(g.G01, P00, mul(g.G11, P10)))), dJ11 = neg(keep(solid, fma(g.G01, P01, mul(g.G11, P11))));
+    const F dJ00 = neg(keep(solid, fma(g.G00, P00, mul(g.G10, P10))));
+    const F dJ01 = neg(keep(solid, fma(g.G00, P01, mul(g.G10, P11))));
+    const F dJ10 = neg(keep(solid, fma(g.G01, P00, mul(g.G11, P10))));
+    const F dJ11 = neg(keep(solid, fma(g.G01, P01, mul(g.G11, P11))));
 
     // J = K2 Jn, (mx, my) = K2 (nx, ny) + k
-    const F k00 = splat(camera.K2[0]), k01 = splat(camera.K2[1]), k10 = splat(camera.K2[2]), k11 = splat(camera.K2[3]);
+    const F k00 = splat(camera.K2[0]), k01 = splat(camera.K2[1]);
+    const F k10 = splat(camera.K2[2]), k11 = splat(camera.K2[3]);
     const F dn00 = fma(k00, dJ00, mul(k10, dJ10)), dn01 = fma(k00, dJ01, mul(k10, dJ11));
     const F dn10 = fma(k01, dJ00, mul(k11, dJ10)), dn11 = fma(k01, dJ01, mul(k11, dJ11));
     F d_nx = fma(k00, p.mx, mul(k10, p.my)), d_ny = fma(k01, p.mx, mul(k11, p.my));
@@ -91,72 +91,99 @@ MASS_INLINE void differentiate(const CameraData& camera, const SurfelLanes& s, c
     dc[1] = mul(d_ny, inverse_z);
     dc[2] = sub(dc[2], mul(inverse_z, fma(g.nx, d_nx, mul(g.ny, d_ny))));
 
-    const F sign = select(lt(zero, g.facing), splat(-1.0f), splat(1.0f));
-    F dn[3];
+    // The blended normal is +-n / |n| with n = u x v.
+    const F inverse_length = div(select(lt(zero, g.facing), splat(-1.0f), splat(1.0f)), sqrt(g.normal2));
+    const F along = div(dot3(p.normal, g.n), g.normal2);
+    F dn[3], from_u[3], from_v[3];
+    for (int k = 0; k < 3; ++k) dn[k] = keep(exists, mul(inverse_length, fnma(along, g.n[k], p.normal[k])));
+    cross3(g.v, dn, from_u);
+    cross3(dn, g.u, from_v);
     for (int k = 0; k < 3; ++k) {
-        dn[k] = keep(exists, mul(sign, p.normal[k]));
-        du[k] = keep(exists, du[k]);
-        dv[k] = keep(exists, dv[k]);
+        du[k] = keep(exists, add(du[k], from_u[k]));
+        dv[k] = keep(exists, add(dv[k], from_v[k]));
         dc[k] = keep(exists, dc[k]);
         sums.t[k] = add(sums.t[k], dc[k]);
     }
     add_outer(sums.A, dc, s.mean);
-    add_outer(sums.A, du, g.axis_u);
-    add_outer(sums.A, dv, g.axis_v);
-    add_outer(sums.A, dn, g.axis_n);
-
-    F world[3], U[3], V[3], N[3];
-    rotate_back(camera.A, dc, world);
-    rotate_back(camera.A, du, U);
-    rotate_back(camera.A, dv, V);
-    rotate_back(camera.A, dn, N);
-
-    // Unit quaternion -> rotation columns, then through the normalisation.
-    const F w = g.q[0], x = g.q[1], y = g.q[2], z = g.q[3], two = splat(2.0f);
-    const F q[4] = {
-        mul(two, fma(z, sub(U[1], V[0]), fma(y, sub(N[0], U[2]), mul(x, sub(V[2], N[1]))))),
-        mul(two, fma(y, add(U[1], V[0]), fma(z, add(U[2], N[0]), fma(w, sub(V[2], N[1]), mul(mul(splat(-2.0f), x), add(V[1], N[2])))))),
-        mul(two, fma(x, add(U[1], V[0]), fma(z, add(V[2], N[1]), fma(w, sub(N[0], U[2]), mul(mul(splat(-2.0f), y), add(U[0], N[2])))))),
-        mul(two, fma(x, add(U[2], N[0]), fma(y, add(V[2], N[1]), fma(w, sub(U[1], V[0]), mul(mul(splat(-2.0f), z), add(U[0], V[1])))))),
-    };
-    const F along = fma(w, q[0], fma(x, q[1], fma(y, q[2], mul(z, q[3]))));
-    for (int k = 0; k < 4; ++k) store(out.quat[k], mul(g.inverse_norm, fnma(g.q[k], along, q[k])));
-    for (int k = 0; k < 3; ++k) store(out.mean[k], world[k]);
-    store(out.scale[0], d_su);
-    store(out.scale[1], d_sv);
-    store(out.opacity, p.opacity);
-    for (int k = 0; k < 3; ++k) store(out.color[k], p.color[k]);
+    add_outer(sums.A, du, s.tangent);
+    add_outer(sums.A, dv, s.tangent + 3);
+    rotate_back(camera.A, dc, d_mean);
+    rotate_back(camera.A, du, d_tangent);
+    rotate_back(camera.A, dv, d_tangent + 3);
 }
 
-MASS_INLINE void scatter(const LaneGradient& g, const int* ids, int count, const SurfelGradient& out) {
+// Through the harmonics, from the gradient of the clamped colour; adds to the gradient of the mean.
+MASS_INLINE void differentiate_harmonics(const CameraData& camera, const SurfelData& in, const int* ids, const F* mean,
+                                         const F* d_color, M exists, CameraSums& sums, F* d_mean, LaneGradient& out) {
+    const int K = in.coefficients;
+    alignas(64) float lanes[48][kLanes];
+    for (int l = 0; l < kLanes; ++l) {
+        const float* from = in.harmonics + static_cast<int64_t>(ids[l]) * 3 * K;
+        for (int k = 0; k < 3 * K; ++k) lanes[k][l] = from[k];
+    }
+    F Y[16], d[3], h[48], color[3], free[3], along[16];
+    const F inverse_distance = view_direction(camera, mean, d);
+    harmonic_basis(d, K, Y);
+    for (int k = 0; k < 3 * K; ++k) h[k] = load(lanes[k]);
+    harmonic_color(Y, h, K, color);
+    for (int c = 0; c < 3; ++c) free[c] = keep(both(exists, lt(splat(0.0f), color[c])), d_color[c]);
+    for (int k = 0; k < K; ++k) {
+        along[k] = splat(0.0f);
+        for (int c = 0; c < 3; ++c) {
+            store(out.harmonics[3 * k + c], mul(Y[k], free[c]));
+            along[k] = fma(h[3 * k + c], free[c], along[k]);
+        }
+    }
+    if (K == 1) return;
+    F dd[3];
+    harmonic_gradient(d, K, along, dd);
+    const F radial = dot3(d, dd);
+    for (int k = 0; k < 3; ++k) {
+        const F moved = keep(exists, mul(inverse_distance, fnma(radial, d[k], dd[k])));
+        d_mean[k] = add(d_mean[k], moved);
+        sums.center[k] = sub(sums.center[k], moved);
+    }
+}
+
+MASS_INLINE void scatter(const LaneGradient& g, const int* ids, int count, const SurfelData& in, const SurfelGradient& out) {
+    const int coefficients = 3 * in.coefficients;
     for (int l = 0; l < count; ++l) {
         const int64_t i = ids[l];
         for (int k = 0; k < 3; ++k) out.means[3 * i + k] = g.mean[k][l];
-        for (int k = 0; k < 4; ++k) out.quats[4 * i + k] = g.quat[k][l];
-        for (int k = 0; k < 2; ++k) out.scales[2 * i + k] = g.scale[k][l];
+        for (int k = 0; k < 6; ++k) out.tangents[6 * i + k] = g.tangent[k][l];
         out.opacities[i] = g.opacity[l];
-        for (int k = 0; k < 3; ++k) out.colors[3 * i + k] = g.color[k][l];
+        if (out.colors) {
+            for (int k = 0; k < 3; ++k) out.colors[3 * i + k] = g.color[k][l];
+        } else {
+            for (int k = 0; k < coefficients; ++k) out.harmonics[coefficients * i + k] = g.harmonics[k][l];
+        }
     }
 }
 
 void project_backward(const CameraData& camera, const SurfelData& in, const uint32_t* slot_begin, const PairSums& sums,
                       const SurfelGradient& out, float* camera_gradient, int begin, int end) {
-    const int64_t first = begin, count = end - begin;
-    __builtin_memset(out.means + 3 * first, 0, sizeof(float) * 3 * static_cast<size_t>(count));
-    __builtin_memset(out.quats + 4 * first, 0, sizeof(float) * 4 * static_cast<size_t>(count));
-    __builtin_memset(out.scales + 2 * first, 0, sizeof(float) * 2 * static_cast<size_t>(count));
-    __builtin_memset(out.opacities + first, 0, sizeof(float) * static_cast<size_t>(count));
-    __builtin_memset(out.colors + 3 * first, 0, sizeof(float) * 3 * static_cast<size_t>(count));
+    const int64_t first = begin;
+    const size_t count = sizeof(float) * static_cast<size_t>(end - begin);
+    __builtin_memset(out.means + 3 * first, 0, 3 * count);
+    __builtin_memset(out.tangents + 6 * first, 0, 6 * count);
+    __builtin_memset(out.opacities + first, 0, count);
+    if (out.colors) {
+        __builtin_memset(out.colors + 3 * first, 0, 3 * count);
+    } else {
+        const int64_t width = 3 * in.coefficients;
+        __builtin_memset(out.harmonics + width * first, 0, static_cast<size_t>(width) * count);
+    }
 
     CameraSums camera_sums;
     for (F& x : camera_sums.A) x = splat(0.0f);
     for (F& x : camera_sums.t) x = splat(0.0f);
     for (F& x : camera_sums.K2) x = splat(0.0f);
     for (F& x : camera_sums.k) x = splat(0.0f);
+    for (F& x : camera_sums.center) x = splat(0.0f);
 
     int ids[kLanes], lanes = 0;
     alignas(64) float total[16], pixel[16][kLanes];
-    alignas(64) float exists[kLanes];
+    alignas(64) float present[kLanes];
     for (int i = begin; i <= end; ++i) {
         if (i < end) {
             if (!collect(sums, slot_begin[i], slot_begin[i + 1], total)) continue;
@@ -166,12 +193,13 @@ void project_backward(const CameraData& camera, const SurfelData& in, const uint
         }
         if (lanes < kLanes && (i < end || lanes == 0)) continue;
         for (int l = 0; l < kLanes; ++l) {
-            exists[l] = l < lanes ? 1.0f : 0.0f;
+            present[l] = l < lanes ? 1.0f : 0.0f;
             if (l >= lanes) {
                 ids[l] = ids[0];
                 for (int k = 0; k < 16; ++k) pixel[k][l] = 0.0f;
             }
         }
+        const M exists = lt(splat(0.0f), load(present));
         PixelSums p;
         for (int k = 0; k < 3; ++k) p.color[k] = load(pixel[k]);
         p.opacity = load(pixel[3]);
@@ -186,15 +214,24 @@ void project_backward(const CameraData& camera, const SurfelData& in, const uint
         p.my = load(pixel[12]);
         for (int k = 0; k < 3; ++k) p.normal[k] = load(pixel[13 + k]);
         const SurfelLanes s = load_lanes(in, ids);
+        F d_mean[3], d_tangent[6];
         LaneGradient lane_gradient;
-        differentiate(camera, s, make_geometry(camera, s), p, lt(splat(0.0f), load(exists)), camera_sums, lane_gradient);
-        scatter(lane_gradient, ids, lanes, out);
+        differentiate(camera, s, make_geometry(camera, s), p, exists, camera_sums, d_mean, d_tangent);
+        if (in.harmonics) {
+            differentiate_harmonics(camera, in, ids, s.mean, p.color, exists, camera_sums, d_mean, lane_gradient);
+        }
+        for (int k = 0; k < 3; ++k) store(lane_gradient.mean[k], d_mean[k]);
+        for (int k = 0; k < 6; ++k) store(lane_gradient.tangent[k], d_tangent[k]);
+        store(lane_gradient.opacity, p.opacity);
+        for (int k = 0; k < 3; ++k) store(lane_gradient.color[k], p.color[k]);
+        scatter(lane_gradient, ids, lanes, in, out);
         lanes = 0;
     }
     for (int k = 0; k < 9; ++k) camera_gradient[k] = sum(camera_sums.A[k]);
     for (int k = 0; k < 3; ++k) camera_gradient[9 + k] = sum(camera_sums.t[k]);
     for (int k = 0; k < 4; ++k) camera_gradient[12 + k] = sum(camera_sums.K2[k]);
     for (int k = 0; k < 2; ++k) camera_gradient[16 + k] = sum(camera_sums.k[k]);
+    for (int k = 0; k < 3; ++k) camera_gradient[18 + k] = sum(camera_sums.center[k]);
 }
 
 }  // namespace mass::MASS_ISA

@@ -1,6 +1,7 @@
 #include "renderer.hpp"
 
 #include <atomic>
+#include <chrono>
 #include <cstring>
 #include <stdexcept>
 
@@ -28,6 +29,20 @@ std::vector<const KernelTable*> tables() {
     found.push_back(&scalar::table);
     return found;
 }
+
+class Stopwatch {
+public:
+    // Seconds since it was made or last asked.
+    double lap() {
+        const auto now = std::chrono::steady_clock::now();
+        const double seconds = std::chrono::duration<double>(now - last_).count();
+        last_ = now;
+        return seconds;
+    }
+
+private:
+    std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
+};
 
 int chunks(int count) { return (count + kChunk - 1) / kChunk; }
 
@@ -74,12 +89,12 @@ std::unique_ptr<FrameBuffers> Renderer::acquire() {
 
 void Renderer::recycle(std::unique_ptr<FrameBuffers> frame) {
     std::lock_guard<std::mutex> lock(mutex_);
-    if (free_.size() < kKeptFrames) free_.push_back(std::move(frame));
+    if (free_.size() < kKeptFrames && !(frame->camera.without & kWithoutReuse)) free_.push_back(std::move(frame));
 }
 
 std::unique_ptr<FrameBuffers> Renderer::forward(const CameraData& camera, const SurfelData& surfels, const ImageData& images,
                                                 float* weights, bool differentiable, int threads) {
-    auto frame = acquire();
+    auto frame = camera.without & kWithoutReuse ? std::make_unique<FrameBuffers>() : acquire();
     const int count = surfels.count;
     frame->camera = camera;
     frame->count = count;
@@ -100,16 +115,20 @@ std::unique_ptr<FrameBuffers> Renderer::forward(const CameraData& camera, const 
     }
 
     const ProjectedData projected = frame->projected();
+    FrameProfile& profile = frame->profile = {};
+    Stopwatch watch;
     std::atomic<int> dropped{0};
     pool_.loop(chunks(count), threads, [&](int chunk) {
         const int begin = chunk * kChunk, end = count - begin < kChunk ? count : begin + kChunk;
         dropped += table_->project(camera, surfels, projected, begin, end);
     });
     frame->dropped = dropped;
+    profile.project = watch.lap();
 
     Binning& binning = frame->binning;
     binning.assign(camera, projected.boxes, projected.keys, count, differentiable || weights != nullptr, pool_, threads);
     const PairData pairs = binning.pairs();
+    profile.list = watch.lap();
 
     float* slot_weights = nullptr;
     if (weights) {
@@ -117,11 +136,16 @@ std::unique_ptr<FrameBuffers> Renderer::forward(const CameraData& camera, const 
         if (binning.pair_count() > 0) std::memset(slot_weights, 0, binning.pair_count() * sizeof(float));
     }
     const PixelState state = frame->state();
-    pool_.loop(camera.tiles_x * camera.tiles_y, threads,
-               [&](int tile) {
-                   binning.sort(tile);
-                   table_->blend(camera, projected, pairs, images, state, slot_weights, tile);
-               });
+    std::atomic<int64_t> blocks{0}, sort_nanoseconds{0};
+    pool_.loop(camera.tiles_x * camera.tiles_y, threads, [&](int tile) {
+        Stopwatch sorting;
+        binning.sort(tile, (camera.without & kWithoutFastSort) != 0);
+        sort_nanoseconds += static_cast<int64_t>(1e9 * sorting.lap());
+        blocks += table_->blend(camera, projected, pairs, images, state, slot_weights, tile);
+    });
+    profile.sort = 1e-9 * static_cast<double>(sort_nanoseconds);
+    profile.blocks = blocks;
+    profile.blend = watch.lap();
 
     if (weights) {
         pool_.loop(chunks(count), threads, [&](int chunk) {
@@ -132,6 +156,7 @@ std::unique_ptr<FrameBuffers> Renderer::forward(const CameraData& camera, const 
                 weights[i] = sum;
             }
         });
+        profile.gather_weights = watch.lap();
     }
     return frame;
 }
@@ -149,10 +174,14 @@ void Renderer::backward(FrameBuffers& frame, const SurfelData& surfels, const Im
     sums.gradient = frame.pair_gradient.reserve(pair_count);
     sums.extra = extra;
     sums.touched = frame.touched.reserve(pair_count + 1);
+    Stopwatch watch;
     std::memset(sums.touched, 0, pair_count);
+    std::atomic<int64_t> blocks{0};
     pool_.loop(camera.tiles_x * camera.tiles_y, threads, [&](int tile) {
-        table_->blend_backward(camera, projected, pairs, images, state, gradient, sums, tile);
+        blocks += table_->blend_backward(camera, projected, pairs, images, state, gradient, sums, tile);
     });
+    frame.profile.blocks_backward = blocks;
+    frame.profile.blend_backward = watch.lap();
 
     const int n = chunks(frame.count);
     float* partial = frame.camera_partial.reserve(size(n) * kCameraGradient + 1);
@@ -166,6 +195,7 @@ void Renderer::backward(FrameBuffers& frame, const SurfelData& surfels, const Im
         for (int chunk = 0; chunk < n; ++chunk) sum += partial[size(chunk) * kCameraGradient + size(k)];
         camera_gradient[k] = static_cast<float>(sum);
     }
+    frame.profile.project_backward = watch.lap();
 }
 
 }  // namespace mass

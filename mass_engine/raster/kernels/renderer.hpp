@@ -13,6 +13,13 @@
 
 namespace mass {
 
+// Where the time of a frame went, in seconds, and how much there was to do.
+struct FrameProfile {
+    double project = 0, list = 0, blend = 0, gather_weights = 0, blend_backward = 0, project_backward = 0;
+    double sort = 0;  // part of blend, summed over threads
+    int64_t blocks = 0, blocks_backward = 0;
+};
+
 // Everything one forward pass leaves for its backward pass.
 struct FrameBuffers {
     Buffer<Splat> splats;
@@ -30,6 +37,7 @@ struct FrameBuffers {
     int count = 0;
     bool extra = false, differentiable = false;
     int dropped = 0;
+    FrameProfile profile;
 
     ProjectedData projected() const;
     PixelState state() const;

@@ -8,21 +8,40 @@
 
 namespace mass {
 
+// Which pixels a surfel may touch: where its opacity reaches the alpha cut, or what other renderers allow it.
+enum class Bounds : int { kExact = 0, kInria = 1, kGsplat = 2 };
+
+// What can be left out to measure what it is worth; the image stays the same bit for bit.
+enum Without : unsigned {
+    kWithoutTightBounds = 1,  // bounds of opacity 1 whatever the opacity
+    kWithoutBlocks = 2,       // every block of a tile that the box meets
+    kWithoutShortPath = 4,    // the full sum for surfels of which only the low-pass part can show
+    kWithoutEarlyStop = 8,    // blocks go on after their last pixel has ended
+    kWithoutEmptyTiles = 16,  // empty tiles are blended like any other
+    kWithoutReuse = 32,       // buffers are allocated anew for each frame
+    kWithoutFastSort = 64,    // a comparison sort of each tile
+};
+
 struct CameraData {
     float A[9];   // world_to_camera rotation, row major
     float t[3];   // world_to_camera translation
     float K2[4];  // upper left 2 x 2 of K
     float k[2];   // principal point, pixels
+    float center[3];  // the camera's place in the world
     float near_z, inverse_near;
     int width, height;
     int tiles_x, tiles_y;
     bool cull_backfaces;
+    Bounds bounds;
+    bool center_depth;       // every pixel of a surfel has its centre's depth
     float distortion_scale;  // b in m = a - b / z
+    unsigned without;        // Without
 };
 
+// means [N,3], tangents [N,2,3], opacities [N], and either colors [N,3] or harmonics [N,K,3].
 struct SurfelData {
-    const float *means, *quats, *scales, *opacities, *colors;
-    int count;
+    const float *means, *tangents, *opacities, *colors, *harmonics;
+    int count, coefficients;  // N, K (1, 4, 9 or 16)
 };
 
 // Inclusive pixel bounds inside the image; x1 < x0 when the surfel is not seen.
@@ -88,11 +107,11 @@ struct alignas(64) PairGradient {
 };
 
 struct SurfelGradient {
-    float *means, *quats, *scales, *opacities, *colors;
+    float *means, *tangents, *opacities, *colors, *harmonics;
 };
 
-// dA (9), dt (3), dK2 (4), dk (2)
-inline constexpr int kCameraGradient = 18;
+// dA (9), dt (3), dK2 (4), dk (2), and of the camera's centre through view directions (3)
+inline constexpr int kCameraGradient = 21;
 
 struct PairSums {
     PairGradient* gradient;
@@ -105,10 +124,11 @@ struct KernelTable {
     const char* name;
     // Surfels [begin, end) -> projected. Returns the number dropped because of bad numbers.
     int (*project)(const CameraData&, const SurfelData&, const ProjectedData&, int begin, int end);
-    void (*blend)(const CameraData&, const ProjectedData&, const PairData&, const ImageData&, const PixelState&,
-                  float* slot_weights, int tile);
-    void (*blend_backward)(const CameraData&, const ProjectedData&, const PairData&, const ImageData&,
-                           const PixelState&, const ImageGradient&, const PairSums&, int tile);
+    // Both return the number of (surfel, block) evaluations.
+    int64_t (*blend)(const CameraData&, const ProjectedData&, const PairData&, const ImageData&, const PixelState&,
+                     float* slot_weights, int tile);
+    int64_t (*blend_backward)(const CameraData&, const ProjectedData&, const PairData&, const ImageData&,
+                              const PixelState&, const ImageGradient&, const PairSums&, int tile);
     void (*project_backward)(const CameraData&, const SurfelData&, const uint32_t* slot_begin, const PairSums&,
                              const SurfelGradient&, float* camera_gradient, int begin, int end);
 };

@@ -10,10 +10,9 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.raster import RasterOptions, RenderOutput, rasterize
-from mass_engine.raster import cpu as cpu_backend
-from mass_engine.raster._kernels import Renderer
+from mass_engine.surfel.inellipse import principal_tangents
 
-NAMES = ("means", "quats", "scales", "opacities", "colors", "world_to_camera", "K")
+NAMES = ("means", "tangents", "opacities", "colors", "world_to_camera", "K")
 IMAGES = ("rgb", "alpha", "depth", "median_depth", "normal", "distortion")
 EVERYTHING = RasterOptions(outputs="all", distortion_range=(0.3, 1.5))
 
@@ -21,13 +20,12 @@ EVERYTHING = RasterOptions(outputs="all", distortion_range=(0.3, 1.5))
 @dataclass(frozen=True)
 class Surfels:
     means: Tensor
-    quats: Tensor
-    scales: Tensor
+    tangents: Tensor
     opacities: Tensor
     colors: Tensor
 
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        return self.means, self.quats, self.scales, self.opacities, self.colors
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.means, self.tangents, self.opacities, self.colors
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Surfels:
         return Surfels(*(change(t) for t in self.tensors()))
@@ -49,7 +47,8 @@ def camera(width: int = 61, height: int = 43, off_center: bool = True) -> Camera
     return replace(made, K=K, world_to_camera=pose)
 
 
-def surfels(kind: str, count: int, seed: int) -> Surfels:
+def surfels(kind: str, count: int, seed: int, harmonics: int = 0) -> Surfels:
+    """``count`` of them; ``harmonics`` 1, 4, 9 or 16 instead of plain colours."""
     g = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> Tensor:
@@ -84,7 +83,13 @@ def surfels(kind: str, count: int, seed: int) -> Surfels:
         means, quats, scales = (t[:half_count].repeat(2, 1)[:count] for t in (means, quats, scales))
     else:
         assert kind == "overlapping"
-    return Surfels(means, quats, scales, opacities, colors)
+    tangents = principal_tangents(scales, quats)
+    if kind == "overlapping":  # conjugate half-diameters need not be the axes
+        shear = torch.tensor([[1.0, 0.6], [-0.3, 0.9]])
+        tangents = shear @ tangents
+    if harmonics:
+        colors = 0.4 * torch.randn(count, harmonics, 3, generator=g)
+    return Surfels(means, tangents, opacities, colors)
 
 
 KINDS = ("overlapping", "grazing", "behind", "huge", "tiny", "needles", "opaque", "faint", "twins")
@@ -95,12 +100,8 @@ def images(out: RenderOutput) -> dict[str, Tensor]:
     return {name: getattr(out, name) for name in names}
 
 
-def render(
-    scene: Surfels, view: Camera, options: RasterOptions = EVERYTHING, renderer: Renderer | None = None
-) -> RenderOutput:
-    if renderer is None:
-        return rasterize(*scene.tensors(), view, options=options)
-    return cpu_backend.rasterize(*scene.tensors(), view, options, renderer)
+def render(scene: Surfels, view: Camera, options: RasterOptions = EVERYTHING) -> RenderOutput:
+    return rasterize(*scene.tensors(), view, options=options)
 
 
 def with_gradients(
@@ -108,14 +109,13 @@ def with_gradients(
     view: Camera,
     options: RasterOptions,
     dtype: torch.dtype,
-    renderer: Renderer | None = None,
     weights: dict[str, Tensor] | None = None,
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
     """Render, then the gradient of a fixed random combination of all images in every input and the camera."""
     leaves = [t.detach().to(dtype).clone().requires_grad_() for t in scene.tensors()]
     pose = view.world_to_camera.to(dtype).clone().requires_grad_()
     K = view.K.to(dtype).clone().requires_grad_()
-    out = render(Surfels(*leaves), Camera(K, pose, view.width, view.height), options, renderer)
+    out = render(Surfels(*leaves), Camera(K, pose, view.width, view.height), options)
     g = torch.Generator().manual_seed(99)
     loss = torch.zeros((), dtype=dtype)
     for name, image in images(out).items():

@@ -15,7 +15,8 @@ import pytest
 import torch
 
 from mass_engine.raster import RasterOptions
-from mass_engine.raster._kernels import Renderer, instruction_sets
+from mass_engine.raster._kernels import instruction_sets
+from mass_engine.raster.types import Convention
 from tests.engine.raster.scenes import (
     EVERYTHING,
     KINDS,
@@ -31,13 +32,11 @@ REFERENCE = replace(EVERYTHING, backend="reference")
 CASES = [(1, 0, (61, 43)), (40, 1, (61, 43)), (300, 2, (33, 50))]
 
 
-def check_images(
-    scene: Surfels, size: tuple[int, int], options: RasterOptions, renderer: Renderer | None
-) -> None:
+def check_images(scene: Surfels, size: tuple[int, int], options: RasterOptions) -> None:
     view = camera(*size)
     with torch.no_grad():
         expected = render(scene.map(torch.Tensor.double), view, replace(options, backend="reference"))
-        got = render(scene, view, options, renderer)
+        got = render(scene, view, options)
     assert got.dropped == expected.dropped
     for name, image in images(got).items():
         error = (image - images(expected)[name]).abs()
@@ -54,7 +53,7 @@ def check_images(
 def test_images_and_gradients(kind: str, case: tuple[int, int, tuple[int, int]]) -> None:
     count, seed, size = case
     scene, view = surfels(kind, count, seed), camera(*size)
-    check_images(scene, size, EVERYTHING, None)
+    check_images(scene, size, EVERYTHING)
     # A depth divides by alpha: weigh its gradient by it, or the faintest pixels decide.
     alpha = render(scene, view).alpha
     weights = dict.fromkeys(("rgb", "alpha", "normal", "distortion"), torch.ones(()))
@@ -69,23 +68,23 @@ def test_images_and_gradients(kind: str, case: tuple[int, int, tuple[int, int]])
 @pytest.mark.parametrize("name", instruction_sets())
 @pytest.mark.parametrize("outputs", ["color", "all"])
 def test_every_instruction_set(name: str, outputs: str) -> None:
-    options = replace(EVERYTHING, outputs=outputs)  # type: ignore[arg-type]
+    options = replace(EVERYTHING, outputs=outputs, instruction_set=name)  # type: ignore[arg-type]
     scene, view = surfels("overlapping", 200, 5), camera()
-    check_images(scene, (61, 43), options, Renderer(name))
+    check_images(scene, (61, 43), options)
     _, expected = with_gradients(scene, view, replace(options, backend="reference"), torch.float64)
-    _, got = with_gradients(scene, view, options, torch.float32, Renderer(name))
+    _, got = with_gradients(scene, view, options, torch.float32)
     for key, gradient in expected.items():
         assert float((got[key] - gradient).norm()) <= 1e-3 * float(gradient.norm()), key
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 70), (16, 16), (17, 15), (129, 5)])
 def test_odd_sizes(size: tuple[int, int]) -> None:
-    check_images(surfels("overlapping", 150, 3), size, EVERYTHING, None)
+    check_images(surfels("overlapping", 150, 3), size, EVERYTHING)
 
 
 def test_backface_culling_drops_what_faces_away() -> None:
     scene, options = surfels("overlapping", 200, 4), replace(EVERYTHING, cull_backfaces=True)
-    check_images(scene, (61, 43), options, None)
+    check_images(scene, (61, 43), options)
     kept = (render(scene, camera(), options).weight_sum > 0).sum()
     assert 0 < int(kept) < int((render(scene, camera()).weight_sum > 0).sum())
 
@@ -99,8 +98,32 @@ def test_no_surfel_at_all() -> None:
 
 def test_a_hundred_thousand_surfels() -> None:
     scene = surfels("overlapping", 100_000, 6)
-    scene = replace(scene, scales=0.05 * scene.scales)
-    check_images(scene, (11, 9), EVERYTHING, None)
+    scene = replace(scene, tangents=0.05 * scene.tangents)
+    check_images(scene, (11, 9), EVERYTHING)
+
+
+@pytest.mark.parametrize("harmonics", [1, 4, 9, 16])
+def test_harmonics(harmonics: int) -> None:
+    scene, view = surfels("overlapping", 150, 8, harmonics), camera()
+    check_images(scene, (61, 43), EVERYTHING)
+    assert float(render(scene, view).rgb.std()) > 0.02
+    _, expected = with_gradients(scene, view, REFERENCE, torch.float64)
+    _, got = with_gradients(scene, view, EVERYTHING, torch.float32)
+    for key, gradient in expected.items():
+        assert float((got[key] - gradient).norm()) <= 1e-3 * float(gradient.norm()), key
+
+
+@pytest.mark.parametrize("convention", ["inria", "gsplat"])
+@pytest.mark.parametrize("kind", ["overlapping", "huge", "grazing"])
+def test_conventions_of_other_renderers(kind: str, convention: Convention) -> None:
+    """Kernels and reference draw the same whole tiles and the same depths."""
+    options = replace(EVERYTHING, convention=convention)
+    scene, view = surfels(kind, 60, 4), camera(90, 70)
+    check_images(scene, (90, 70), options)
+    _, expected = with_gradients(scene, view, replace(options, backend="reference"), torch.float64)
+    _, got = with_gradients(scene, view, options, torch.float32)
+    for key in ("means", "tangents", "opacities", "colors"):
+        assert float((got[key] - expected[key]).norm()) <= 5e-3 * float(expected[key].norm()), key
 
 
 def test_part_of_the_gradients() -> None:
@@ -117,7 +140,7 @@ def test_part_of_the_gradients() -> None:
             if other == name:
                 break
         (image * weight).sum().backward()
-        for key, leaf in zip(("means", "quats", "scales", "opacities", "colors"), leaves, strict=True):
+        for key, leaf in zip(("means", "tangents", "opacities", "colors"), leaves, strict=True):
             got = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
             assert float((got - expected[key]).norm()) <= 5e-3 * float(expected[key].norm()) + 1e-12, (
                 name,

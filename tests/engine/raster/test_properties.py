@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mass_engine.camera import Camera
-from mass_engine.raster._kernels import Renderer, instruction_sets
-from mass_engine.raster.reference import rotation_matrices
+from mass_engine.raster._kernels import instruction_sets
+from mass_engine.surfel.inellipse import quat_to_matrix
 from tests.engine.raster.scenes import (
     EVERYTHING,
     KINDS,
@@ -43,14 +43,14 @@ def moved(scene: Surfels, view: Camera, seed: int) -> tuple[Surfels, Camera]:
     """The same scene and camera in another world frame."""
     g = torch.Generator().manual_seed(seed)
     turn = torch.randn(1, 4, generator=g, dtype=torch.float64)
-    R, t = rotation_matrices(turn)[0], torch.randn(3, generator=g, dtype=torch.float64)
-    w, x, y, z = (turn / turn.norm())[0].tolist()
-    left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
+    R, t = quat_to_matrix(turn / turn.norm())[0], torch.randn(3, generator=g, dtype=torch.float64)
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3], motion[:3, 3] = R, t
     pose = view.world_to_camera.double() @ torch.linalg.inv(motion)
     made = replace(
-        scene, means=(scene.means.double() @ R.T + t).float(), quats=(scene.quats.double() @ left.T).float()
+        scene,
+        means=(scene.means.double() @ R.T + t).float(),
+        tangents=(scene.tangents.double() @ R.T).float(),
     )
     return made, replace(view, world_to_camera=pose.float())
 
@@ -83,13 +83,12 @@ def test_a_crop_shows_the_same_pixels(kind: str, seed: int, x: int, y: int, widt
 @pytest.mark.parametrize("name", instruction_sets()[:2])
 @pytest.mark.parametrize("kind", ["overlapping", "huge", "twins"])
 def test_any_number_of_threads_gives_the_same_bits(name: str, kind: str) -> None:
-    scene, view, renderer = surfels(kind, 9000, 8), camera(150, 97), Renderer(name)
-    scene = replace(scene, scales=scene.scales * (1.0 if kind == "huge" else 0.2))
+    scene, view = surfels(kind, 9000, 8), camera(150, 97)
+    scene = replace(scene, tangents=scene.tangents * (1.0 if kind == "huge" else 0.2))
     results = []
     for threads in (1, 2, 3, 7, 2, 1):
-        out, gradients = with_gradients(
-            scene, view, replace(EVERYTHING, threads=threads), torch.float32, renderer
-        )
+        options = replace(EVERYTHING, threads=threads, instruction_set=name)  # type: ignore[arg-type]
+        out, gradients = with_gradients(scene, view, options, torch.float32)
         results.append(
             {**images(out), "weight_sum": out.weight_sum, **{f"d_{k}": v for k, v in gradients.items()}}
         )
@@ -101,7 +100,7 @@ def test_any_number_of_threads_gives_the_same_bits(name: str, kind: str) -> None
 
 def test_ties_in_depth_go_by_index() -> None:
     scene = surfels("twins", 2, 1)
-    scene = replace(scene, opacities=torch.tensor([0.9, 0.9]), scales=torch.full((2, 2), 0.5))
+    scene = replace(scene, opacities=torch.tensor([0.9, 0.9]), tangents=20 * scene.tangents)
     scene = replace(scene, colors=torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
     rgb = render(scene, camera()).rgb
     assert bool((rgb[..., 0] >= rgb[..., 1]).all())

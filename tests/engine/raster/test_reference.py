@@ -11,13 +11,14 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.raster import RasterOptions, _kernels, rasterize, types
-from mass_engine.raster.types import Backend
+from mass_engine.raster.types import Backend, Convention
+from mass_engine.surfel.inellipse import principal_tangents
 from tests.engine.raster.scenes import Surfels, images
 
 REFERENCE = RasterOptions(backend="reference", outputs="all", distortion_range=(0.3, 1.5))
 
 
-def smooth_scene(seed: int) -> tuple[Surfels, Camera]:
+def smooth_scene(seed: int, harmonics: int = 0) -> tuple[Surfels, Camera]:
     """Every surfel covers the whole image well inside its alpha cut and no pixel ends: all is smooth."""
     g = torch.Generator().manual_seed(seed)
     n = 4
@@ -27,7 +28,10 @@ def smooth_scene(seed: int) -> tuple[Surfels, Camera]:
 
     means = torch.stack([0.04 * (rand(n) - 0.5), 0.04 * (rand(n) - 0.5), torch.linspace(0.5, 0.9, n)], -1)
     quats = torch.cat([torch.ones(n, 1), 0.4 * (rand(n, 3) - 0.5)], -1) * (0.5 + rand(n, 1))
-    scene = Surfels(means, quats, 0.12 + 0.1 * rand(n, 2), 0.3 + 0.3 * rand(n), rand(n, 3))
+    shear = torch.tensor([[1.0, 0.2], [-0.1, 0.9]], dtype=torch.float64)
+    tangents = shear @ principal_tangents(0.12 + 0.1 * rand(n, 2), quats)
+    colors = 0.3 * (rand(n, harmonics, 3) - 0.5) if harmonics else rand(n, 3)
+    scene = Surfels(means, tangents, 0.3 + 0.3 * rand(n), colors)
     K = torch.tensor([[9.0, 0.3, 3.7], [0.0, 10.0, 2.6], [0.0, 0.0, 1.0]], dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([0.01, -0.02, 0.03])
@@ -35,17 +39,23 @@ def smooth_scene(seed: int) -> tuple[Surfels, Camera]:
 
 
 @pytest.mark.parametrize("name", ["rgb", "alpha", "depth", "median_depth", "normal", "distortion"])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_gradients_match_finite_differences(name: str, seed: int) -> None:
-    scene, camera = smooth_scene(seed)
+@pytest.mark.parametrize(
+    ("seed", "harmonics", "convention"),
+    [(0, 0, "exact"), (1, 0, "gsplat"), (1, 4, "exact"), (0, 16, "inria")],
+)
+def test_gradients_match_finite_differences(
+    name: str, seed: int, harmonics: int, convention: Convention
+) -> None:
+    scene, camera = smooth_scene(seed, harmonics)
+    options = replace(REFERENCE, convention=convention)
     inputs = [t.clone().requires_grad_() for t in (*scene.tensors(), camera.world_to_camera, camera.K)]
 
     def image(*given: Tensor) -> Tensor:
-        m, q, s, o, c, pose, K = given
+        m, t, o, c, pose, K = given
         # Only the upper rows are parameters of the camera.
         pose = torch.cat([pose[:3], torch.zeros(1, 4, dtype=pose.dtype)])
         K = torch.cat([K[:2], torch.zeros(1, 3, dtype=K.dtype)])
-        out = rasterize(m, q, s, o, c, Camera(K, pose, camera.width, camera.height), options=REFERENCE)
+        out = rasterize(m, t, o, c, Camera(K, pose, camera.width, camera.height), options=options)
         return images(out)[name]
 
     with torch.no_grad():
@@ -58,9 +68,8 @@ def facing(depths: list[float], opacity: float, scale: float = 10.0) -> Surfels:
     means = torch.tensor([[0.0, 0.0, z] for z in depths], dtype=torch.float64)
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(n, 1)
     ones = torch.ones(n, dtype=torch.float64)
-    return Surfels(
-        means, quats, scale * ones[:, None].repeat(1, 2), opacity * ones, torch.eye(3)[:n].double()
-    )
+    tangents = principal_tangents(scale * ones[:, None].repeat(1, 2), quats)
+    return Surfels(means, tangents, opacity * ones, torch.eye(3)[:n].double())
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
@@ -85,7 +94,8 @@ def test_a_slanted_disk_gives_the_depth_of_its_plane() -> None:
     angle = 0.5
     quats = torch.tensor([[math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0]], dtype=torch.float64)
     camera = Camera.from_fov(21, 11, 60.0)
-    out = rasterize(scene.means, quats, *scene.tensors()[2:], camera, options=REFERENCE)
+    tangents = principal_tangents(torch.full((1, 2), 10.0, dtype=torch.float64), quats)
+    out = rasterize(scene.means, tangents, *scene.tensors()[2:], camera, options=REFERENCE)
     x = (torch.arange(21) + 0.5 - 10.5) / camera.K[0, 0]
     normal = torch.tensor([math.sin(angle), math.cos(angle)])
     expected = normal[1] / (normal[0] * x + normal[1])  # z with n.(x z, z) = n.(0, 1)
@@ -114,7 +124,7 @@ def test_the_clamp_passes_no_gradient() -> None:
         scene = facing([1.0], 1.0).map(lambda t: t.float().requires_grad_())
         out = rasterize(*scene.tensors(), Camera.from_fov(3, 3, 10.0), options=options)
         out.alpha.sum().backward()
-        for tensor in scene.tensors()[:4]:
+        for tensor in scene.tensors()[:3]:
             assert tensor.grad is not None
             assert float(tensor.grad.abs().max()) == 0.0
 
@@ -122,4 +132,4 @@ def test_the_clamp_passes_no_gradient() -> None:
 def test_the_reference_and_the_kernels_use_the_same_constants() -> None:
     for name, value in _kernels.CONSTANTS.items():
         assert getattr(types, name.upper()) == pytest.approx(value, rel=1e-7)
-    assert len(_kernels.CONSTANTS) == 6
+    assert len(_kernels.CONSTANTS) == 8

@@ -14,7 +14,6 @@ import torch
 from mass_engine.camera import Camera
 from mass_engine.errors import BadArgumentError
 from mass_engine.raster import RasterOptions, rasterize
-from mass_engine.raster._kernels import Renderer
 from tests.engine.raster.scenes import EVERYTHING, Surfels, camera, images, render, surfels, with_gradients
 
 BAD = [math.nan, math.inf, -math.inf]
@@ -25,10 +24,10 @@ def test_bad_numbers_are_dropped_and_counted(backend: str) -> None:
     options = replace(EVERYTHING, backend=backend)  # type: ignore[arg-type]
     scene, view = surfels("overlapping", 80, 0), camera()
     spoilt = scene.map(torch.Tensor.clone)
-    spoilt.means[3, 1], spoilt.quats[7, 0], spoilt.scales[11, 1] = BAD
+    spoilt.means[3, 1], spoilt.tangents[7, 0, 2], spoilt.tangents[11, 1, 1] = BAD
     spoilt.opacities[20], spoilt.colors[30, 2] = math.nan, math.inf
-    spoilt.quats[40], spoilt.scales[50, 0], spoilt.scales[60, 1] = 0.0, 0.0, -0.01
-    bad = [3, 7, 11, 20, 30, 40, 50, 60]
+    spoilt.tangents[40, 0], spoilt.tangents[50, 1] = 0.0, 2 * spoilt.tangents[50, 0]  # no area
+    bad = [3, 7, 11, 20, 30, 40, 50]
     keep = torch.ones(80, dtype=torch.bool)
     keep[bad] = False
     out, gradients = with_gradients(spoilt, view, options, torch.float32)
@@ -37,13 +36,13 @@ def test_bad_numbers_are_dropped_and_counted(backend: str) -> None:
     assert clean.dropped == 0
     for name, image in images(clean).items():
         assert torch.equal(image, images(out)[name]), name
-    for name in ("means", "quats", "scales", "opacities", "colors"):
+    for name in ("means", "tangents", "opacities", "colors"):
         assert torch.isfinite(gradients[name]).all(), name
         assert float(gradients[name][bad].abs().max()) == 0.0
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-12, 1e6, 1e18, 1e30])
-@pytest.mark.parametrize("which", ["means", "scales", "quats"])
+@pytest.mark.parametrize("which", ["means", "tangents"])
 def test_extreme_numbers_never_poison_the_image(which: str, factor: float) -> None:
     scene = surfels("overlapping", 50, 1)
     scene = replace(scene, **{which: getattr(scene, which) * factor})
@@ -59,15 +58,13 @@ def test_extreme_numbers_never_poison_the_image(which: str, factor: float) -> No
 
 def test_exactly_edge_on_disks_show_their_low_pass_part() -> None:
     """The axis of view lies in the disk's plane: no plane to meet, and no gradient of it."""
-    half = math.sqrt(0.5)
-    means, scales = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[0.1, 0.1]])
-    for quats in ([[half, half, 0.0, 0.0]], [[half, 0.0, half, 0.0]]):
+    means = torch.tensor([[0.0, 0.0, 1.0]])
+    for axis in ([0.0, 0.1, 0.0], [0.1, 0.0, 0.0]):
         leaves = [
             means.clone().requires_grad_(),
-            torch.tensor(quats).requires_grad_(),
-            scales.clone().requires_grad_(),
+            torch.tensor([[axis, [0.0, 0.0, 0.1]]]).requires_grad_(),
         ]
-        scene = Surfels(leaves[0], leaves[1], leaves[2], torch.tensor([0.8]), torch.ones(1, 3))
+        scene = Surfels(leaves[0], leaves[1], torch.tensor([0.8]), torch.ones(1, 3))
         out = render(scene, Camera.from_fov(9, 9, 30.0))
         alpha, depth = out.alpha.detach(), out.depth.detach()
         expected = 0.8 * math.exp(-1.0)
@@ -77,7 +74,7 @@ def test_exactly_edge_on_disks_show_their_low_pass_part() -> None:
         assert float(depth[4, 5]) == pytest.approx(1.0, abs=1e-5)
         (out.rgb.sum() + out.depth.sum()).backward()
         assert all(leaf.grad is not None and bool(torch.isfinite(leaf.grad).all()) for leaf in leaves)
-        assert float(leaves[2].grad.abs().max()) == 0.0  # type: ignore[union-attr]
+        assert float(leaves[1].grad.abs().max()) == 0.0  # type: ignore[union-attr]
 
 
 def test_background_and_its_gradient() -> None:
@@ -96,7 +93,7 @@ def test_background_and_its_gradient() -> None:
 
 def broken(**changes: Any) -> None:
     scene, view = surfels("overlapping", 5, 0), camera()
-    names = ("means", "quats", "scales", "opacities", "colors", "camera")
+    names = ("means", "tangents", "opacities", "colors", "camera")
     arguments: dict[str, Any] = dict(zip(names, (*scene.tensors(), view), strict=True))
     arguments |= changes
     rasterize(**arguments)
@@ -106,7 +103,8 @@ def broken(**changes: Any) -> None:
     ("changes", "code"),
     [
         ({"means": torch.zeros(4, 3)}, "raster.shape"),
-        ({"scales": torch.ones(5, 3)}, "raster.shape"),
+        ({"tangents": torch.ones(5, 3)}, "raster.shape"),
+        ({"colors": torch.zeros(5, 5, 3)}, "raster.shape"),
         ({"opacities": torch.ones(5, 1)}, "raster.shape"),
         ({"colors": torch.zeros(5, 3, dtype=torch.uint8)}, "raster.dtype"),
         ({"background": torch.zeros(4)}, "raster.shape"),
@@ -116,6 +114,11 @@ def broken(**changes: Any) -> None:
         ({"options": RasterOptions(near=0.0)}, "raster.near"),
         ({"options": RasterOptions(threads=0)}, "raster.threads"),
         ({"options": RasterOptions(distortion_range=(1.0, 1.0))}, "raster.distortion_range"),
+        ({"options": RasterOptions(window=(0, 0, 62, 1))}, "raster.window"),
+        ({"options": RasterOptions(window=(5, -1, 2, 2))}, "raster.window"),
+        ({"options": RasterOptions(convention="other")}, "raster.convention"),  # type: ignore[arg-type]
+        ({"options": RasterOptions(instruction_set="mmx")}, "raster.instruction_set"),  # type: ignore[arg-type]
+        ({"options": RasterOptions(without=frozenset({"luck"}))}, "raster.without"),  # type: ignore[arg-type]
         ({"options": RasterOptions(backend="gpu")}, "raster.backend"),  # type: ignore[arg-type]
         ({"options": RasterOptions(outputs="depth")}, "raster.outputs"),  # type: ignore[arg-type]
     ],
@@ -135,19 +138,17 @@ def test_an_output_that_was_not_asked_for_says_so() -> None:
 
 def test_graphs_alive_at_once_do_not_share_buffers() -> None:
     """Several views rendered before any backward pass, as one fitting step over several cameras does."""
-    renderer = Renderer()
     scene = surfels("overlapping", 300, 3)
     views = [camera(61, 43), camera(33, 70), camera(90, 20)]
     alone = []
     for view in views:
         leaf = scene.means.clone().requires_grad_()
-        out = render(replace(scene, means=leaf), view, EVERYTHING, renderer)
+        out = render(replace(scene, means=leaf), view, EVERYTHING)
         out.rgb.sum().backward()
         alone.append(leaf.grad)
     leaves = [scene.means.clone().requires_grad_() for _ in views]
     outs = [
-        render(replace(scene, means=leaf), view, EVERYTHING, renderer)
-        for leaf, view in zip(leaves, views, strict=True)
+        render(replace(scene, means=leaf), view, EVERYTHING) for leaf, view in zip(leaves, views, strict=True)
     ]
     for out in reversed(outs):
         out.rgb.sum().backward(retain_graph=True)
@@ -160,14 +161,14 @@ def test_graphs_alive_at_once_do_not_share_buffers() -> None:
 
 
 def test_several_python_threads_share_one_renderer() -> None:
-    renderer, view = Renderer(), camera(90, 70)
+    view = camera(90, 70)
     scenes = [surfels("overlapping", 6000, seed) for seed in range(4)]
     options = replace(EVERYTHING, threads=2)
-    expected = [render(scene, view, options, renderer).rgb for scene in scenes]
+    expected = [render(scene, view, options).rgb for scene in scenes]
     wrong: list[int] = []
 
     def work(index: int) -> None:
-        rendered = [render(scenes[index], view, options, renderer).rgb for _ in range(10)]
+        rendered = [render(scenes[index], view, options).rgb for _ in range(10)]
         wrong.extend(index for rgb in rendered if not torch.equal(rgb, expected[index]))
 
     workers = [threading.Thread(target=work, args=(i,)) for i in range(4)]

@@ -211,7 +211,8 @@ def test_only_centres_that_can_be_seen_are_drawn() -> None:
     assert float(ball("surfels").values[:, 2].max()) < 0.3
     front, back = sheet(0.3, 0.05), sheet(0.4, 0.2)
     means = torch.cat([front, back])
-    seen = draw(means, toward_camera(len(means)), 0.006, "surfels").numbers()
+    # A little light gets through the front sheet: what is behind it has a weight, but is not to be drawn.
+    seen = draw(means, toward_camera(len(means)), 0.006, "surfels", opacity=0.3).numbers()
     assert (seen[:, 2] < 0.35).sum() == len(front)
     before = seen[(np.abs(seen[:, :2] - 50.5) < 9).all(-1)]
     assert (before[:, 2] < 0.35).all()

@@ -16,6 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from mass_engine.camera import Camera
+from mass_engine.channels import Channel, ChannelImage, extract, parse_channel, raster_options
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.fitting.subject import (
     Appearance,
@@ -94,15 +95,19 @@ class Avatar:
         self, pose: HandPose, camera: Camera, options: RasterOptions | None = None
     ) -> RenderOutput:
         """Rasterise one pose (a batch of one) over black."""
+        return self._rasterize(self.posed(pose), camera, options or RasterOptions(cull_backfaces=True))
+
+    def image(self, pose: HandPose, camera: Camera, channel: Channel = "rgb") -> ChannelImage:
+        """One channel of one pose (a batch of one)."""
+        surfels = self.posed(pose)
+        means = surfels.row(0).means
+        out = self._rasterize(surfels, camera, raster_options(channel, means, camera))
+        return extract(channel, out, means, camera)
+
+    def _rasterize(self, surfels: PosedSurfels, camera: Camera, options: RasterOptions) -> RenderOutput:
+        bones = self.binding.bones[self.kept]
         with torch.no_grad():
-            return render_row(
-                self.appearance,
-                self.posed(pose),
-                0,
-                self.binding.bones[self.kept],
-                camera,
-                options or RasterOptions(cull_backfaces=True),
-            )
+            return render_row(self.appearance, surfels, 0, bones, camera, options)
 
     def resolve_pose(self, spec: str) -> HandPose:
         """``frame:N``, a named pose or 48 numbers -> a placed pose with this hand's shape (batch of one).
@@ -142,16 +147,32 @@ class Avatar:
         center = (vertices.amax(0) + vertices.amin(0)) / 2
         return center, float((vertices - center).norm(dim=-1).max())
 
-    def render(
-        self, pose_spec: str, camera_spec: str = "orbit:0,0", width: int = 512, height: int = 512
-    ) -> NDArray[np.uint8]:
-        """A picture uint8 [H,W,4], straight-alpha RGBA. Raises BadArgumentError for a bad specification."""
+    def view(
+        self,
+        pose_spec: str,
+        camera_spec: str = "orbit:0,0",
+        width: int = 512,
+        height: int = 512,
+        channel: str = "rgb",
+    ) -> ChannelImage:
+        """One channel of a pose seen by a camera. Raises BadArgumentError for a bad specification."""
         if not (1 <= width <= 16384 and 1 <= height <= 16384):
             raise BadArgumentError("size.invalid", f"{width}x{height} is not a picture.", "Use 1 to 16384.")
+        wanted = parse_channel(channel)
         pose = self.resolve_pose(pose_spec)
         center, radius = self._bounds(pose)
-        camera = parse_camera(camera_spec, self.camera, width, height, center, radius)
-        return straight_rgba(self.render_pose(pose, camera))
+        return self.image(pose, parse_camera(camera_spec, self.camera, width, height, center, radius), wanted)
+
+    def render(
+        self,
+        pose_spec: str,
+        camera_spec: str = "orbit:0,0",
+        width: int = 512,
+        height: int = 512,
+        channel: str = "rgb",
+    ) -> NDArray[np.uint8]:
+        """The picture of :meth:`view`: straight-alpha RGBA uint8 [H,W,4]."""
+        return self.view(pose_spec, camera_spec, width, height, channel).picture()
 
     def cloud(self, pose_spec: str = "rest") -> SurfelCloud:
         """The surfels in a pose, shaded as in the clip; hand at the origin for poses that are no frame.
@@ -277,11 +298,3 @@ def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Avatar:
         SourceFrames(tensors["frames.indices"], tensors["frames.heldout"], pose),
         int(metadata["best_frame"]),
     )
-
-
-def straight_rgba(out: RenderOutput) -> NDArray[np.uint8]:
-    """Premultiplied colour and alpha -> straight-alpha RGBA uint8 [H,W,4]."""
-    alpha = out.alpha.clamp(0, 1)
-    color = torch.where(alpha.unsqueeze(-1) > 1e-4, out.rgb / alpha.clamp_min(1e-4).unsqueeze(-1), 0.0)
-    picture = torch.cat([color.clamp(0, 1), alpha.unsqueeze(-1)], -1)
-    return cast("NDArray[np.uint8]", (picture * 255).round().to(torch.uint8).numpy())

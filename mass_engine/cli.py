@@ -61,7 +61,15 @@ def build_parser() -> argparse.ArgumentParser:
         help="source, orbit:YAW,PITCH[,METRES] or a JSON file",
     )
     render.add_argument("--size", default="512x512", metavar="WxH")
-    render.add_argument("--out", type=Path, required=True)
+    render.add_argument(
+        "--channel", default="rgb", metavar="rgb|alpha|depth|normal|distortion|surfels", help="what to show"
+    )
+    render.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        help="a .png, .webp or .jpg picture, or the channel's numbers as .npy; with --frames a directory",
+    )
     render.set_defaults(run=_render)
 
     export = commands.add_parser("export", help="write the avatar's surfels for other tools")
@@ -170,10 +178,17 @@ def _render(arguments: argparse.Namespace) -> None:
             "render.what", "Say what to render.", "Give either --frames or --pose, not both."
         )
     if arguments.frames is not None:
-        count = render_frames(arguments.run_dir, arguments.frames, arguments.out)
+        count = render_frames(arguments.run_dir, arguments.frames, arguments.out, arguments.channel)
         print(f"wrote {count} frames to {arguments.out}")
     else:
-        render_to_file(arguments.run_dir, arguments.pose, arguments.camera, arguments.size, arguments.out)
+        render_to_file(
+            arguments.run_dir,
+            arguments.pose,
+            arguments.camera,
+            arguments.size,
+            arguments.out,
+            arguments.channel,
+        )
         print(f"wrote {arguments.out}")
 
 

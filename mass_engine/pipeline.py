@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import torch
 
-from mass_engine.avatar import Avatar, row_pose, straight_rgba
+from mass_engine.avatar import Avatar, row_pose
 from mass_engine.evaluation.scores import mean_scores, score_view
 from mass_engine.export.ply import write_ply
 from mass_engine.fitting.report import FitReport, machine, peak_memory_bytes, versions
@@ -154,7 +154,7 @@ def _write_previews(outcome: FitOutcome, directory: Path) -> None:
     views, avatar = outcome.clip.views, outcome.avatar
     for row in torch.linspace(0, len(views) - 1, min(PREVIEWS, len(views))).round().int().unique().tolist():
         view = views[row]
-        rgba = straight_rgba(avatar.render_pose(row_pose(avatar.frames.pose, row), view.camera))
+        rgba = avatar.image(row_pose(avatar.frames.pose, row), view.camera).picture()
         over = rgba[..., 3:] / 255.0
         beside = (rgba[..., :3] * over + view.rgb * (0.25 * (1 - over))).astype("uint8")
         pair = cv2.hconcat([view.rgb, beside])

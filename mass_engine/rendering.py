@@ -9,15 +9,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mass_engine.avatar import Avatar, straight_rgba
+from mass_engine.avatar import Avatar
+from mass_engine.channels import parse_channel
 from mass_engine.errors import BadArgumentError
 
+#: The suffix of a file of numbers: one NumPy array, for any program that reads arrays.
+_NUMBERS = ".npy"
 
-def render_frames(run: Path, frames: str, out: Path) -> int:
+
+def render_frames(run: Path, frames: str, out: Path, channel: str = "rgb") -> int:
     """Write OUT/%06d.png of ``all``, ``holdout`` or a list of frame indices; returns how many.
 
-    Straight-alpha RGBA at the video's upright size through the fitted camera.
+    Straight-alpha RGBA at the video's upright size through the fitted camera; each picture's ``channel`` has
+    its own scale (see ``mass_engine.channels``).
     """
+    wanted = parse_channel(channel)
+    if out.suffix == _NUMBERS:
+        raise BadArgumentError(
+            "render.out", "Frames go into a directory, as pictures.", "Use --pose frame:12 for numbers."
+        )
     avatar = Avatar.load(run)
     indices = avatar.frames.indices.tolist()
     if frames == "holdout":
@@ -34,13 +44,16 @@ def render_frames(run: Path, frames: str, out: Path) -> int:
         indices = [int(number) for number in frames.split(",")]
     out.mkdir(parents=True, exist_ok=True)
     for index in indices:
-        picture = straight_rgba(avatar.render_pose(avatar.frames.pose_of(index), avatar.camera))
-        _write(picture, out / f"{index:06d}.png")
+        image = avatar.image(avatar.frames.pose_of(index), avatar.camera, wanted)
+        _write(image.picture(), out / f"{index:06d}.png")
     return len(indices)
 
 
-def render_to_file(run: Path, pose: str, camera: str, size: str, out: Path) -> None:
-    """Render one pose to an image file (png, jpg, webp). ``camera`` may name a JSON file."""
+def render_to_file(run: Path, pose: str, camera: str, size: str, out: Path, channel: str = "rgb") -> None:
+    """Render one pose to an image file (png, jpg, webp), or its channel's numbers to a ``.npy`` file.
+
+    ``camera`` may name a JSON file.
+    """
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size)
     if match is None:
         raise BadArgumentError("size.invalid", f"{size!r} is not a size.", "Use 512x512, say.")
@@ -54,7 +67,21 @@ def render_to_file(run: Path, pose: str, camera: str, size: str, out: Path) -> N
                 f"There is no camera file {camera!r}.",
                 "Use source, orbit:YAW,PITCH or a JSON file.",
             ) from error
-    _write(Avatar.load(run).render(pose, camera, width, height), out)
+    parse_channel(channel)  # a wrong word is told before the avatar is read
+    image = Avatar.load(run).view(pose, camera, width, height, channel)
+    if out.suffix == _NUMBERS:
+        _write_numbers(image.numbers(), out)
+    else:
+        _write(image.picture(), out)
+
+
+def _write_numbers(values: NDArray[np.float32], path: Path) -> None:
+    try:
+        np.save(path, values)
+    except OSError as error:
+        raise BadArgumentError(
+            "render.out", f"{path} cannot be written.", "Use a path in a directory that exists."
+        ) from error
 
 
 def _write(picture: NDArray[np.uint8], path: Path) -> None:
@@ -64,4 +91,6 @@ def _write(picture: NDArray[np.uint8], path: Path) -> None:
     except cv2.error:
         written = False
     if not written:
-        raise BadArgumentError("render.out", f"{path} cannot be written.", "Use a .png, .webp or .jpg path.")
+        raise BadArgumentError(
+            "render.out", f"{path} cannot be written.", "Use a .png, .webp, .jpg or .npy path."
+        )

@@ -163,7 +163,9 @@ def _render(options: argparse.Namespace) -> int:
     width, height = options.size
     with MassClient(options.url) as client:
         image_format = _FORMATS[options.out.suffix.lower()]
-        picture = client.render(options.id, options.pose, options.camera, width, height, image_format)
+        picture = client.render(
+            options.id, options.pose, options.camera, width, height, image_format, options.channel
+        )
     options.out.write_bytes(picture)
     print(options.out)
     return 0
@@ -247,6 +249,9 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--pose", default="rest", help="rest, fist, frame:12, ... (default: rest)")
     render.add_argument("--camera", default="source", help="source or orbit:YAW,PITCH,DISTANCE")
     render.add_argument("--size", type=_size, default=(512, 512), metavar="WxH")
+    render.add_argument(
+        "--channel", default="rgb", metavar="rgb|alpha|depth|normal|distortion|surfels", help="what to show"
+    )
     render.add_argument("--out", type=_picture, required=True, help="a .png, .jpg or .webp file")
     download = command("download", _download, "Download the files of a finished job.", job=True)
     download.add_argument("name", nargs="?", help="one file (default: all)")

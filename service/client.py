@@ -171,9 +171,20 @@ class MassClient:
         width: int = 512,
         height: int = 512,
         image_format: str = "png",
+        channel: str = "rgb",
     ) -> bytes:
-        """An encoded picture (``png``, ``jpeg`` or ``webp``) of the finished hand."""
-        query = {"pose": pose, "camera": camera, "width": width, "height": height, "format": image_format}
+        """An encoded picture (``png``, ``jpeg`` or ``webp``) of the finished hand.
+
+        ``channel``: ``rgb``, ``alpha``, ``depth``, ``normal``, ``distortion`` or ``surfels``.
+        """
+        query = {
+            "pose": pose,
+            "camera": camera,
+            "width": width,
+            "height": height,
+            "format": image_format,
+            "channel": channel,
+        }
         return self._request("GET", f"{_path(job_id)}/render", params=query).content
 
     def assets(self, job_id: str) -> list[AssetInfo]:

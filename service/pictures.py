@@ -18,6 +18,8 @@ from typing import Literal
 from service.problems import Kind, ProblemError
 
 PictureFormat = Literal["png", "jpeg", "webp"]
+#: What of the hand is shown; the engine's names (mass_engine/channels.py says how each looks).
+Channel = Literal["rgb", "alpha", "depth", "normal", "distortion", "surfels"]
 
 POSE_VALUES = 48
 MAX_SIDE = 4096
@@ -31,13 +33,14 @@ _FRAME = re.compile(r"frame:([0-9]{1,7})")
 
 @dataclass(frozen=True)
 class View:
-    """One picture of one hand: canonical pose and camera, size in pixels, encoding."""
+    """One picture of one hand: canonical pose and camera, size in pixels, encoding, what is shown."""
 
     pose: str
     camera: str
     width: int
     height: int
     format: PictureFormat
+    channel: Channel = "rgb"
 
     @property
     def media_type(self) -> str:
@@ -51,12 +54,18 @@ class View:
 
 
 def canonical_view(
-    pose: str, camera: str, width: int, height: int, picture: PictureFormat, max_pixels: int
+    pose: str,
+    camera: str,
+    width: int,
+    height: int,
+    picture: PictureFormat,
+    max_pixels: int,
+    channel: Channel = "rgb",
 ) -> View:
     """The one spelling of this request. Raises ProblemError (422) for what can never be a picture."""
     if width * height > max_pixels:
         raise ProblemError(Kind.RENDER_TOO_LARGE, f"{width} x {height} is more than {max_pixels} pixels.")
-    return View(_pose(pose.strip().lower()), _camera(camera.strip().lower()), width, height, picture)
+    return View(_pose(pose.strip().lower()), _camera(camera.strip().lower()), width, height, picture, channel)
 
 
 def _pose(text: str) -> str:

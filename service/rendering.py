@@ -39,8 +39,8 @@ class RenderRefusedError(Exception):
 class Renderer(Protocol):
     """A loaded avatar: makes uint8 [H,W,4] straight-alpha RGBA pictures. Raises RenderRefusedError."""
 
-    def render(self, pose: str, camera: str, width: int, height: int) -> NDArray[np.uint8]:
-        """One picture."""
+    def render(self, pose: str, camera: str, width: int, height: int, channel: str) -> NDArray[np.uint8]:
+        """One picture of one channel."""
         ...
 
 
@@ -59,11 +59,11 @@ class _EngineAvatar:
         except EngineError as error:
             raise RenderRefusedError(error.code, error.message, error.advice, argument=False) from error
 
-    def render(self, pose: str, camera: str, width: int, height: int) -> NDArray[np.uint8]:
+    def render(self, pose: str, camera: str, width: int, height: int, channel: str) -> NDArray[np.uint8]:
         from mass_engine import BadArgumentError, EngineError
 
         try:
-            image: NDArray[np.uint8] = self._avatar.render(pose, camera, width, height)
+            image: NDArray[np.uint8] = self._avatar.render(pose, camera, width, height, channel)
         except EngineError as error:
             argument = isinstance(error, BadArgumentError)
             raise RenderRefusedError(error.code, error.message, error.advice, argument=argument) from error
@@ -228,7 +228,7 @@ def _serve(connection: Connection, loader: Loader, warm: int) -> None:
             avatars.move_to_end(path)
             while len(avatars) > warm:
                 avatars.popitem(last=False)
-            image = avatars[path].render(view.pose, view.camera, view.width, view.height)
+            image = avatars[path].render(view.pose, view.camera, view.width, view.height, view.channel)
             answer: tuple[Any, ...] = ("picture", encode(image, view.format))
         except RenderRefusedError as error:
             answer = ("refused", error.code, error.message, error.advice, error.argument)

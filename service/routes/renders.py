@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service.pictures import MAX_SIDE, MIN_SIDE, PictureFormat, canonical_view
+from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, canonical_view
 from service.problems import Kind, declared
 from service.routes.jobs import JobId
 from service.services import ServicesDep, not_modified
@@ -66,10 +66,20 @@ def render_job(
     width: Side = 512,
     height: Side = 512,
     format: Annotated[PictureFormat, Query()] = "png",
+    channel: Annotated[
+        Channel,
+        Query(
+            description="What is shown. `rgb`; `alpha`: grey; `depth`: near bright, far dark, between the "
+            "hand's nearest and farthest point; `normal`: x right, y up, z to the viewer as red, green, "
+            "blue; `distortion`: where surfels lie apart along the ray, from black up to the hand's 99th "
+            "percentile; `surfels`: the centres of the visible surfels as white disks."
+        ),
+    ] = "rgb",
 ) -> Response:
     """Render the hand. Repeated requests are answered from a cache; use `If-None-Match`."""
     artifact = services.artifact(job_id)
-    view = canonical_view(pose, camera, width, height, format, services.settings.max_render_pixels)
+    most = services.settings.max_render_pixels
+    view = canonical_view(pose, camera, width, height, format, most, channel)
     headers = {"ETag": view.etag(job_id, artifact), "Cache-Control": "private, no-cache"}
     if not_modified(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)

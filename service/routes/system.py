@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from importlib.metadata import version
-from typing import Literal
+from typing import Literal, get_args
 
 from fastapi import APIRouter
 from pydantic import BaseModel
 
-from service.pictures import MAX_SIDE, MIN_SIDE, POSE_VALUES
+from service.pictures import MAX_SIDE, MIN_SIDE, POSE_VALUES, Channel, PictureFormat
 from service.problems import Kind, ProblemError, declared
 from service.services import ServicesDep
 
@@ -28,6 +28,7 @@ class Capabilities(BaseModel):
     containers: list[str]
     max_upload_bytes: int
     pictures: list[str]
+    channels: list[str]
     min_render_side: int
     max_render_side: int
     max_render_pixels: int
@@ -58,7 +59,8 @@ def get_capabilities(services: ServicesDep) -> Capabilities:
         version=version("mass-hand"),
         containers=["mp4", "mov", "webm"],
         max_upload_bytes=settings.max_upload_bytes,
-        pictures=["png", "jpeg", "webp"],
+        pictures=list(get_args(PictureFormat)),
+        channels=list(get_args(Channel)),
         min_render_side=MIN_SIDE,
         max_render_side=MAX_SIDE,
         max_render_pixels=settings.max_render_pixels,

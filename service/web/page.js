@@ -86,7 +86,9 @@ async function watch(id) {
 
 function picture() {
   const camera = `orbit:${$("yaw").value},0`;
-  const query = new URLSearchParams({ pose, camera, width: 512, height: 512, format: "webp" });
+  const query = new URLSearchParams({
+    pose, camera, width: 512, height: 512, format: "webp", channel: $("channel").value,
+  });
   $("picture").classList.add("busy");
   $("picture").src = `/jobs/${current}/render?${query}`;
   for (const button of $("poses").children) button.setAttribute("aria-pressed", button.textContent === pose);
@@ -103,7 +105,7 @@ $("poses").append(...POSES.map((name) => {
   return button;
 }));
 $("picture").onload = $("picture").onerror = () => $("picture").classList.remove("busy");
-$("yaw").onchange = picture;
+$("yaw").onchange = $("channel").onchange = picture;
 $("file").onchange = (event) => event.target.files[0] && send(event.target.files[0]);
 $("cancel").onclick = () => call(`/jobs/${current}/cancel`, { method: "POST" }).catch(complain);
 $("delete").onclick = async () => {

@@ -20,7 +20,7 @@ class FakeAvatar:
         self._folder = folder
         self._content = content
 
-    def render(self, pose: str, camera: str, width: int, height: int) -> NDArray[np.uint8]:
+    def render(self, pose: str, camera: str, width: int, height: int, channel: str) -> NDArray[np.uint8]:
         if pose == "die":
             os._exit(9)
         if pose == "hang":
@@ -32,7 +32,7 @@ class FakeAvatar:
             raise ValueError("a bug in the renderer")
         if pose == "unknown":
             raise RenderRefusedError("pose.unknown", "No such pose.", "Use another.", argument=True)
-        digest = hashlib.sha256(self._content + f"{pose}|{camera}".encode()).digest()
+        digest = hashlib.sha256(self._content + f"{pose}|{camera}|{channel}".encode()).digest()
         image = np.empty((height, width, 4), np.uint8)
         image[...] = (*digest[:3], 255)
         image[:, : width // 2, 3] = 0

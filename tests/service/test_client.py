@@ -9,6 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from service.cli import main
 from service.client import AssetInfo, MassClient, ServiceError
 
 JOB = {
@@ -100,6 +101,24 @@ def test_ids_are_quoted() -> None:
     with pytest.raises(ServiceError):
         service.job("../capabilities?x=1#")
     assert made[0].url.raw_path == b"/jobs/..%2Fcapabilities%3Fx%3D1%23"
+
+
+def test_a_render_asks_for_what_was_asked() -> None:
+    service, made = script(httpx.Response(200, content=b"a"), httpx.Response(200, content=b"b"))
+    assert service.render("j", "fist", channel="depth") == b"a"
+    assert made[0].url.params["channel"] == "depth"
+    assert made[0].url.params["pose"] == "fist"
+    service.render("j")
+    assert made[1].url.params["channel"] == "rgb"
+
+
+def test_the_command_line_hands_the_channel_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    service, made = script(httpx.Response(200, content=b"picture"))
+    monkeypatch.setattr("service.cli.MassClient", lambda url: service)
+    out = tmp_path / "a.webp"
+    assert main(["render", "j", "--channel", "surfels", "--out", str(out)]) == 0
+    assert out.read_bytes() == b"picture"
+    assert (made[0].url.params["channel"], made[0].url.params["format"]) == ("surfels", "webp")
 
 
 def test_a_damaged_download_is_refused_and_removed(tmp_path: Path) -> None:

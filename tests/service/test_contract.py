@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from openapi_spec_validator import validate
 
 from service.openapi import document
+from service.pictures import Channel
 from service.problems import Kind
 from tests.service.conftest import VIDEO, Live, problem
 
@@ -84,6 +87,11 @@ def test_capabilities_name_the_limits(live: Live) -> None:
     body = live.http.get("/capabilities").json()
     assert body["max_upload_bytes"] == live.services.settings.max_upload_bytes
     assert body["max_render_pixels"] == live.services.settings.max_render_pixels
+    assert body["channels"] == list(get_args(Channel))
+
+
+def test_the_page_offers_every_channel(live: Live) -> None:
+    assert re.findall(r'<option value="(\w+)"', live.http.get("/").text) == list(get_args(Channel))
 
 
 @pytest.mark.parametrize(

@@ -47,8 +47,9 @@ def test_no_text_is_more_than_a_problem(text: str) -> None:
 
 def test_etags_differ_where_the_request_does() -> None:
     views = [view(), view("fist"), view(camera="orbit:0,0,1"), view(width=65)]
+    views.append(canonical_view("rest", "source", 64, 64, "png", 10**6, "depth"))
     tags = {v.etag("job", "1-a") for v in views} | {view().etag("job", "2-b"), view().etag("other", "1-a")}
-    assert len(tags) == 6
+    assert len(tags) == 7
 
 
 def test_the_cache_drops_the_least_recently_used_and_forgets_jobs() -> None:

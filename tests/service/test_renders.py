@@ -6,6 +6,7 @@ import os
 import signal
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import httpx
@@ -14,7 +15,13 @@ import psutil
 import pytest
 from numpy.typing import NDArray
 
+import mass_engine.channels
+from service.pictures import Channel
+from service.rendering import RenderRefusedError, load_avatar
+from tests.engine.avatars import small_avatar
 from tests.service.conftest import Live, problem
+
+CHANNELS = get_args(Channel)
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +54,29 @@ def test_the_picture_depends_on_pose_camera_and_size(live: Live, job: tuple[str,
     assert (rest[:, :32, 3] == 0).all()
     assert (rest[:, 32:, 3] == 255).all()
     assert pixels(get(live, job[0])).shape == (512, 512, 4)
+
+
+def test_the_picture_depends_on_the_channel(live: Live, job: tuple[str, Path]) -> None:
+    pictures = {name: pixels(get(live, job[0], width=64, height=48, channel=name)) for name in CHANNELS}
+    assert len({picture.tobytes() for picture in pictures.values()}) == len(CHANNELS) == 6
+    assert np.array_equal(pixels(get(live, job[0], width=64, height=48)), pictures["rgb"])
+    plain, depth = (get(live, job[0], channel=name).headers["etag"] for name in ("rgb", "depth"))
+    assert plain != depth
+    assert get(live, job[0]).headers["etag"] == plain
+
+
+def test_the_engine_makes_every_channel(tmp_path: Path) -> None:
+    """The names here are the engine's, and its pictures are what comes out."""
+    assert CHANNELS == mass_engine.channels.CHANNELS
+    avatar = small_avatar()
+    avatar.save(tmp_path / "avatar.safetensors")
+    loaded = load_avatar(tmp_path / "avatar.safetensors")
+    for name in CHANNELS:
+        picture = loaded.render("fist", "orbit:20,0", 40, 32, name)
+        assert np.array_equal(picture, avatar.render("fist", "orbit:20,0", 40, 32, name))
+    with pytest.raises(RenderRefusedError) as refused:
+        loaded.render("fist", "orbit:20,0", 40, 32, "glow")
+    assert (refused.value.code, refused.value.argument) == ("channel.invalid", True)
 
 
 def test_encodings(live: Live, job: tuple[str, Path]) -> None:
@@ -135,6 +165,9 @@ def test_48_angles_are_a_pose(live: Live, job: tuple[str, Path]) -> None:
         ({"height": "tall"}, "request.invalid"),
         ({"width": 601, "height": 600}, "render.too_large"),
         ({"format": "gif"}, "request.invalid"),
+        ({"channel": "glow"}, "request.invalid"),
+        ({"channel": ""}, "request.invalid"),
+        ({"channel": "DEPTH"}, "request.invalid"),
     ],
 )
 def test_bad_requests(live: Live, job: tuple[str, Path], query: dict[str, str | int], code: str) -> None:

@@ -95,7 +95,7 @@ def raster_options(channel: Channel, means: Tensor, camera: Camera) -> RasterOpt
     if channel in ("rgb", "alpha", "depth"):
         return plain
     z = means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
-    z = z[z > plain.near]
+    z = z[z > plain.near_plane]
     if len(z) == 0:
         return RasterOptions(cull_backfaces=True, outputs="all")
     near = float(z.min())

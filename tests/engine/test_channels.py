@@ -26,6 +26,7 @@ from mass_engine.cli import main
 from mass_engine.errors import BadArgumentError
 from mass_engine.raster import rasterize
 from mass_engine.rendering import render_frames, render_to_file
+from mass_engine.surfel.inellipse import principal_tangents
 from tests.engine.avatars import small_avatar
 
 #: Every channel that shows the hand on a transparent ground.
@@ -59,8 +60,7 @@ def draw(
     count = len(means)
     out = rasterize(
         means,
-        facing(normals),
-        torch.full((count, 2), sigma),
+        principal_tangents(torch.full((count, 2), sigma), facing(normals)),
         torch.full((count,), opacity),
         torch.full((count, 3), 0.5),
         camera,

@@ -72,7 +72,7 @@ def report(scene: Scene, camera: Camera, threads: int) -> str:
     """Markdown: milliseconds of each pass, the work done, and the floor by memory and by instructions."""
     options = RasterOptions(cull_backfaces=True, threads=threads)
     tensors = [*scene.tensors(), camera.world_to_camera, camera.K]
-    leaves = [t.float().contiguous().requires_grad_() for t in tensors]
+    leaves = [t.clone().requires_grad_() for t in tensors]
     profiles: list[dict[str, float]] = []
     for _ in range(_REPETITIONS):
         call = Call(camera.width, camera.height, options, keep_frame=True)

@@ -85,7 +85,8 @@ def main() -> None:
         out / "low_pass.png",
     )
     tilted = disks([[-0.4, 0.0, 1.0], [0.4, 0.0, 1.0]], [[0.25, 0.25]] * 2, [0.8, -0.8], 0.99)
-    depths = {c: (r.depth - 0.6) / 0.8 * (r.alpha > 0.1).float() for c, r in renders(tilted, camera).items()}
+    shown = renders(tilted, camera)
+    depths = {c: (r.depth - 0.6) / 0.8 * (r.alpha > 0.1).float() for c, r in shown.items()}
     sheet({c: enlarged(depth, 2, False) for c, depth in depths.items()}, out / "depth.png")
     near = disks([[0.0, 0.0, 0.15], [0.3, 0.0, 1.0]], [[0.02, 0.02], [0.1, 0.1]], [0.0, 0.0], 0.99)
     sheet({c: enlarged(r.alpha, 2, False) for c, r in renders(near, camera).items()}, out / "near.png")
@@ -103,10 +104,9 @@ def main() -> None:
             other = by_convention[name]
             color = (other.rgb - exact.rgb).abs().amax(-1)
             depth = (other.depth - exact.depth).abs()[covered] * 1000
-            print(
-                f"| {count} | {name} | {float(color.max()):.4f} | {float((color > 1 / 255).float().mean()):.2%} "
-                f"| {float(depth.quantile(0.99)):.3f} |"
-            )
+            off = float((color > 1 / 255).float().mean())
+            far = float(depth.quantile(0.99))
+            print(f"| {count} | {name} | {float(color.max()):.4f} | {off:.2%} | {far:.3f} |")
 
 
 if __name__ == "__main__":

@@ -122,7 +122,7 @@ class Avatar:
                 raise BadArgumentError("pose.invalid", f"{spec[:40]!r} names no frame.", "Use frame:12, say.")
             return self.frames.pose_of(int(number))
         best = self.frames.pose_of(self.best_frame)
-        parsed = parse_pose(text, self.shape.model.side)
+        parsed = parse_pose(text, self.shape.model.side, self.shape.model)
         orient = best.global_orient if text in POSE_NAMES else parsed.global_orient.reshape(1, 3)
         pose = HandPose(
             self.shape.betas.reshape(1, 10),

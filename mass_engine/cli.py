@@ -31,7 +31,12 @@ def build_parser() -> argparse.ArgumentParser:
     fit = commands.add_parser("fit", help="fit an avatar to a video")
     fit.add_argument("video", type=Path)
     fit.add_argument("--out", type=Path, required=True, metavar="RUN")
-    fit.add_argument("--template", default="builtin", metavar="builtin|mano:FILE|gltf:FILE")
+    fit.add_argument(
+        "--template",
+        default="builtin",
+        metavar="builtin|mano:FILE|gltf:FILE",
+        help="the hand to start from; after the file ,tips=manopth or ,joints=MAP.json or ,side=left",
+    )
     fit.add_argument("--tracks", type=Path, metavar="FILE", help="use this tracks.json, do not track")
     fit.add_argument(
         "--masks", type=Path, metavar="DIR", help="DIR/%%06d.png: 0 background, 128 ignore, 255 hand"

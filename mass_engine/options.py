@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mass_engine.errors import BadArgumentError
+from mass_engine.template_spec import parse_template
 
 PRESETS = ("draft", "auto", "full")
 SIDES = ("auto", "left", "right")
@@ -15,6 +16,8 @@ DEVICES = ("auto", "cpu", "cuda")
 @dataclass(frozen=True)
 class FitOptions:
     """Options of :func:`mass_engine.fit`; the command line has a flag of the same name for each.
+
+    ``template``: see :mod:`mass_engine.template_spec`.
 
     ``holdout`` N keeps the frames N-1, 2N-1, ... out of the fit (0: none). ``fov`` in degrees spans the
     longer image side; None takes the phone-like default and says so in the report. ``max_frames`` bounds
@@ -49,12 +52,7 @@ class FitOptions:
             raise BadArgumentError(
                 "device.unavailable", "There are no GPU kernels in this build.", "Use --device cpu or auto."
             )
-        if self.template != "builtin":
-            raise BadArgumentError(
-                "template.unsupported",
-                f"The hand template {self.template!r} cannot be read by this version.",
-                "Use --template builtin.",
-            )
+        parse_template(self.template)
 
     def is_heldout(self, index: int) -> bool:
         """Whether the frame with this index is kept out of the fit."""

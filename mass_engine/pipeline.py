@@ -144,6 +144,7 @@ def _tracks(name: str, clip: Clip, result: FitResult) -> Tracks:
         joints,
         torch.stack([torch.from_numpy(view.points) for view in clip.views]).numpy(),
         [view.score for view in clip.views],
+        clip.template,
     )
 
 

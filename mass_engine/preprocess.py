@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from mass_engine.camera import Camera
 from mass_engine.errors import EngineError
 from mass_engine.fitting.views import View
-from mass_engine.hand.builtin import load_builtin
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose, Side
+from mass_engine.hand.template import load_template
 from mass_engine.options import FitOptions
 from mass_engine.progress import ProgressMeter
+from mass_engine.template_spec import parse_template
 from mass_engine.tracking.alignment import align_landmarks, interpolate_pose
 from mass_engine.tracking.landmarks import HandLandmarks
 from mass_engine.tracking.models import HandNetworks
@@ -41,11 +42,15 @@ Warn = Callable[[str, str, str], None]
 
 @dataclass(frozen=True)
 class Clip:
-    """``views`` in time order with their ``start`` poses [F]; ``tracked`` counts frames with a hand."""
+    """``views`` in time order with their ``start`` poses [F]; ``tracked`` counts frames with a hand.
+
+    ``template`` is the name of what ``model`` comes from.
+    """
 
     info: VideoInfo
     camera: Camera
     fov_assumed: bool
+    template: str
     model: HandModel
     views: list[View]
     start: HandPose
@@ -56,6 +61,9 @@ class Clip:
 def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) -> Clip:
     """Read, track, segment and align. Raises EngineError when the video cannot be used."""
     meter.update("read", 0.0)
+    template = load_template(parse_template(options.template))
+    for code, message in template.notes:
+        warn(code, message, "Look at the result with care.")
     info = probe(video)
     imported = None
     if options.tracks is not None:
@@ -64,15 +72,24 @@ def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) 
     camera = Camera.from_fov(info.width, info.height, options.fov or ASSUMED_FOV)
     if imported is not None and options.fov is None:
         camera = replace(camera, K=imported.K)
-    model = load_builtin(marks[0].side)
+    model = template.model(marks[0].side)
     chosen = _choose(marks, options)
     views = _cut_views(video, chosen, times, camera, options, meter)
-    if imported is None:
+    # Shape parameters mean something else on another template: then only the landmarks are of use.
+    if imported is None or imported.template != template.name:
         start = _align(model, views, chosen, camera, meter)
     else:
         start = _rows_of(imported, [view.index for view in views])
     return Clip(
-        info, camera, options.fov is None and imported is None, model, views, start, len(times), len(marks)
+        info,
+        camera,
+        options.fov is None and imported is None,
+        template.name,
+        model,
+        views,
+        start,
+        len(times),
+        len(marks),
     )
 
 

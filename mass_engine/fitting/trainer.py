@@ -22,8 +22,8 @@ from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import white_light
 from mass_engine.tracking.alignment import interpolate_pose
 
-#: How far from the stump's end the hand may be cut, metres at the mean size: a little past the wrist.
-WRIST_REACH = 0.06
+#: How far into the hand from its wrist joint it may be cut, metres at the mean size.
+WRIST_REACH = 0.03
 #: What a pixel of forearm counts against one of hand when the wrist is cut: better a little too long.
 FOREARM_WEIGHT = 0.2
 
@@ -207,13 +207,14 @@ def _keep(evidence: Evidence, binding: MeshBinding, model: HandModel) -> Tensor:
     """
     with torch.no_grad():
         places = binding.surfels(model.template).means
-    along = places[:, 0] if model.side == "right" else -places[:, 0]  # the forearm's axis, outward
-    wrist = along > along.max() - WRIST_REACH
+    along = places[:, 0] - model.joint_template[0, 0]
+    along = along if model.side == "right" else -along  # the forearm's axis, outward
+    wrist = along > -WRIST_REACH
     hand = evidence.hand[wrist]
     other = FOREARM_WEIGHT * (evidence.ignored + evidence.background)[wrist]
     if float(other.sum()) < 0.01 * float(hand.sum()):
         return torch.arange(binding.count)
-    centered = (places[wrist] - places[wrist].mean(0)) / WRIST_REACH
+    centered = (places[wrist] - places[wrist].mean(0)) / (2 * WRIST_REACH)
     plane = torch.zeros(4, requires_grad=True)
     optimizer = torch.optim.LBFGS([plane], max_iter=60, line_search_fn="strong_wolfe")
     total = (hand + other).sum()

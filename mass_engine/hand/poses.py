@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
 
 from mass_engine.errors import BadArgumentError
 from mass_engine.hand.builtin import joint_frames, load_builtin
-from mass_engine.hand.model import mirror_pose
+from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose, Side
 
 #: Degrees of (flexion, abduction, twist) by joint, numbered 1 to 15 in MANO's order; what is not named is 0.
@@ -41,29 +40,30 @@ POSE_NAMES: tuple[str, ...] = tuple(_POSES)
 _ADVICE = f"Use one of {', '.join(POSE_NAMES)}, frame:N, or 48 comma-separated angles in radians."
 
 
-def named_pose(name: str, side: Side) -> HandPose:
-    """A named pose of the mean hand at the origin. Raises BadArgumentError ``pose.invalid``."""
+def named_pose(name: str, side: Side, model: HandModel | None = None) -> HandPose:
+    """A named pose of the mean hand at the origin, of the built-in hand or of ``model`` (of that side).
+
+    Raises BadArgumentError ``pose.invalid``.
+    """
     if name not in _POSES:
         raise BadArgumentError("pose.invalid", f"There is no pose {name[:40]!r}.", _ADVICE)
-    frames = joint_frames(load_builtin("right"))
+    frames = joint_frames(model or load_builtin(side))
     fingers = torch.zeros(15, 3)
     for joint, degrees in _POSES[name].items():
         # Angles about the frame's axes add up as one rotation vector.
         fingers[joint - 1] = torch.tensor(degrees) * (math.pi / 180) @ frames[joint - 1]
-    pose: Tensor = fingers.flatten()
     rest = HandPose.rest(side)
-    hand_pose = pose if side == "right" else mirror_pose(pose)
-    return HandPose(rest.betas, rest.global_orient, hand_pose, rest.transl, side)
+    return HandPose(rest.betas, rest.global_orient, fingers.flatten(), rest.transl, side)
 
 
-def parse_pose(spec: str, side: Side) -> HandPose:
-    """A pose from its name or from 48 numbers (global_orient, then hand_pose; radians).
+def parse_pose(spec: str, side: Side, model: HandModel | None = None) -> HandPose:
+    """A pose from its name (see :func:`named_pose`) or from 48 numbers (global_orient, hand_pose; radians).
 
     Raises BadArgumentError ``pose.invalid``.
     """
     text = spec.strip()
     if text in _POSES:
-        return named_pose(text, side)
+        return named_pose(text, side, model)
     try:
         numbers = [float(part) for part in text.split(",")] if "," in text else []
     except ValueError:

@@ -76,9 +76,10 @@ def _loop_step(
     across = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
     edges, edge_of = np.unique(ends, axis=0, return_inverse=True)
     edge_of = edge_of.reshape(-1)
-    border = np.bincount(edge_of, minlength=len(edges)) == 1
-    on_border = np.zeros(count, bool)
-    on_border[edges[border].ravel()] = True
+    # An edge of three faces or more is a crease like a border.
+    border = np.bincount(edge_of, minlength=len(edges)) != 2
+    creases = np.bincount(edges[border].ravel(), minlength=count)
+    on_border, corner = creases > 0, (creases > 0) & (creases != 2)
     edge_row = count + np.arange(len(edges))
 
     # A new vertex on an edge: 3/8 of its ends and 1/8 of the corners across; half and half on a border.
@@ -88,17 +89,17 @@ def _loop_step(
     columns = [edges[:, 0], edges[:, 1], across[inner_side]]
     values = [end_weight, end_weight, np.full(int(inner_side.sum()), 1 / 8)]
 
-    # An old vertex: Loop's weights of its ring; 3/4 and 1/8, 1/8 along a border.
+    # An old vertex: Loop's weights of its ring; 3/4 and 1/8, 1/8 along a border; a corner stays.
     degree = np.bincount(edges.ravel(), minlength=count)
     n = np.maximum(degree, 1)
     ring_weight = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / n) / 4) ** 2) / n
-    own = np.where(on_border, 3 / 4, 1 - degree * ring_weight)
+    own = np.where(corner, 1.0, np.where(on_border, 3 / 4, 1 - degree * ring_weight))
     rows.append(np.arange(count))
     columns.append(np.arange(count))
     values.append(own)
     for here, there in ((0, 1), (1, 0)):
         a, b = edges[:, here], edges[:, there]
-        weight = np.where(on_border[a], np.where(border, 1 / 8, 0.0), ring_weight[a])
+        weight = np.where(on_border[a], np.where(border & ~corner[a], 1 / 8, 0.0), ring_weight[a])
         rows.append(a)
         columns.append(b)
         values.append(weight)

@@ -24,7 +24,10 @@ _ADVICE = "Give a tracks.json as `mass-engine fit` writes it, for the same video
 @dataclass(frozen=True)
 class Tracks:
     """One hand in F frames: ``indices``, ``times`` [F], ``pose`` batched, ``joints3d`` [F,21,3] camera
-    metres, ``landmarks2d`` [F,21,2] pixels, ``scores`` [F]; ``K`` [3,3] for pictures of ``size`` (w, h)."""
+    metres, ``landmarks2d`` [F,21,2] pixels, ``scores`` [F]; ``K`` [3,3] for pictures of ``size`` (w, h).
+
+    ``template`` names the hand that the poses, and above all ``betas``, are of.
+    """
 
     video: str
     fps: float
@@ -36,6 +39,7 @@ class Tracks:
     joints3d: NDArray[np.float32]
     landmarks2d: NDArray[np.float32]
     scores: list[float]
+    template: str = "builtin"
 
 
 def write_tracks(tracks: Tracks, path: Path) -> None:
@@ -59,6 +63,7 @@ def write_tracks(tracks: Tracks, path: Path) -> None:
         "width": tracks.size[0],
         "height": tracks.size[1],
         "K": _rounded(tracks.K, 4),
+        "template": tracks.template,
         "frames": frames,
     }
     partial = path.with_name(path.name + ".partial")
@@ -120,6 +125,7 @@ def _parse(data: dict[str, Any], side: str, size: tuple[int, int]) -> Tracks:
         column("joints3d", (21, 3)).numpy(),
         column("landmarks2d", (21, 2)).numpy(),
         [min(1.0, max(0.0, float(hand["score"]))) for _, hand in rows],
+        str(data.get("template", "builtin")),
     )
 
 

@@ -78,6 +78,8 @@ BAD_FORMS: dict[str, tuple[bytes, int, str]] = {
     "two videos": (form(("video", VIDEO), ("video", VIDEO)), 422, "request.invalid"),
     "options are not JSON": (form(("options", b"side=left"), ("video", VIDEO)), 422, "options.invalid"),
     "options are a list": (form(("options", b"[]"), ("video", VIDEO)), 422, "options.invalid"),
+    # A request must not name files of the server: templates are for the command line.
+    "a template": (form(("video", VIDEO), ("options", b'{"template": "builtin"}')), 422, "options.invalid"),
     "unknown option": (form(("video", VIDEO), ("options", b'{"color": 1}')), 422, "options.invalid"),
     "fov is no number": (form(("video", VIDEO), ("options", b'{"fov": NaN}')), 422, "options.invalid"),
     "holdout too small": (form(("video", VIDEO), ("options", b'{"holdout": 1}')), 422, "options.invalid"),

@@ -138,3 +138,14 @@ def test_batches_and_gradient() -> None:
 def test_levels_out_of_range_are_refused(levels: int) -> None:
     with pytest.raises(ValueError, match="0 to 3"):
         loop_subdivision(octahedron()[1], 6, levels)
+
+
+def test_any_mesh_keeps_its_place() -> None:
+    # Three triangles on one edge, and two sheets that touch in one corner: what other people's meshes hold.
+    vertices, faces = grid()
+    count = len(vertices)
+    fin = torch.tensor([[7, 8, count], [0, count + 1, count + 2]])
+    vertices = torch.cat([vertices, torch.tensor([[1.5, 1.0, 2.0], [-2.0, 0.0, 0.0], [-2.0, -1.0, 0.0]])])
+    fine = loop_subdivision(torch.cat([faces, fin]), len(vertices), 2)
+    shift = torch.tensor([3.0, -2.0, 5.0])
+    torch.testing.assert_close(fine.apply(vertices + shift), fine.apply(vertices) + shift, atol=1e-5, rtol=0)

@@ -86,7 +86,7 @@ def main() -> None:
     )
     tilted = disks([[-0.4, 0.0, 1.0], [0.4, 0.0, 1.0]], [[0.25, 0.25]] * 2, [0.8, -0.8], 0.99)
     shown = renders(tilted, camera)
-    depths = {c: (r.depth - 0.6) / 0.8 * (r.alpha > 0.1).float() for c, r in shown.items()}
+    depths = {c: (r.depth - 0.6) * (r.alpha > 0.1).float() / 0.8 for c, r in shown.items()}
     sheet({c: enlarged(depth, 2, False) for c, depth in depths.items()}, out / "depth.png")
     near = disks([[0.0, 0.0, 0.15], [0.3, 0.0, 1.0]], [[0.02, 0.02], [0.1, 0.1]], [0.0, 0.0], 0.99)
     sheet({c: enlarged(r.alpha, 2, False) for c, r in renders(near, camera).items()}, out / "near.png")

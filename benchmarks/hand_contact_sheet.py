@@ -57,7 +57,8 @@ class CloseUp:
 _BENDS: tuple[tuple[str, int, float], ...] = (
     ("index knuckle", 1, 90), ("middle knuckle", 4, 90), ("ring knuckle", 10, 90), ("little knuckle", 7, 90),
     ("index middle joint", 2, 90), ("index middle joint", 2, 110), ("little middle joint", 8, 90),
-    ("index last joint", 3, 80), ("thumb root", 13, 45), ("thumb knuckle", 14, 60), ("thumb last joint", 15, 85),
+    ("index last joint", 3, 80), ("thumb root", 13, 45), ("thumb knuckle", 14, 60),
+    ("thumb last joint", 15, 85),
 )  # fmt: skip
 
 _DETAILS: tuple[tuple[str, str, CloseUp], ...] = (
@@ -114,7 +115,9 @@ def picture(
         tone = 0.28 + 0.62 * facing.clamp_min(0) + 0.10 * facing
         colors = tone.clamp(0, 1).unsqueeze(-1) * torch.tensor([0.95, 0.80, 0.72])
         opacities = torch.full((binding.count,), 0.99)
-        out = draw(surfels, opacities, colors, camera, RasterOptions(), torch.full((3,), 0.2))
+        out = draw(
+            surfels, opacities, colors, camera, RasterOptions(cull_backfaces=True), torch.full((3,), 0.2)
+        )
     return np.asarray((out.rgb.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
 
 
@@ -136,7 +139,7 @@ def bent(model: HandModel, joint: int, degrees: float) -> HandPose:
 
 
 def joints_sheet(model: HandModel, binding: MeshBinding, side: int) -> Picture:
-    """Each bend from the thumb's side, from its back and from its inside; little-finger side for its joints."""
+    """Each bend from both sides, from its back and from its inside."""
     rows = []
     for name, joint, degrees in _BENDS:
         pose, frame = bent(model, joint, degrees), joint_frames(model)[joint - 1]
@@ -203,7 +206,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 cells.append(label(picture(model, binding, pose, view, side), f"{name} {amount:+.0f}"))
             rows += [np.hstack(cells[:5]), np.hstack(cells[5:])]
     write(out / "shapes.png", np.vstack(rows))
-    fine = MeshBinding.build(model, 3, 0)
+    fine = MeshBinding.build(model, 2, 1)
     write(out / "joints.png", joints_sheet(model, fine, side))
     write(out / "details.png", details_sheet(model, fine, side))
     return 0

@@ -80,7 +80,7 @@ class PosedSurfels:
     def row(self, row: int) -> AttachedSurfels:
         """The surfels of one pose of the batch."""
         a = self.attached
-        return AttachedSurfels(a.means[row], a.tangents[row], a.normals[row])
+        return AttachedSurfels(a.means[row], a.tangents[row], a.normals[row], a.ratios)
 
 
 def pose_surfels(shape: Shape, binding: MeshBinding, pose: HandPose) -> PosedSurfels:

@@ -29,7 +29,7 @@ _CAP = 1.1
 _CREASES = (0.006, 0.0025)
 #: Up to where (metres from the joint) the skin changes, and over what width it fades.
 _REACH, _FADE = 0.027, 0.010
-_STEPS, _SMOOTHING = 14, 1
+_STEPS, _SMOOTHING = 12, 1
 _Field = Callable[[Vector], Vector]
 
 
@@ -112,11 +112,11 @@ def _onto_turned(
         return smooth_union(near(p), far((p - joint) @ turn + joint), width)
 
     height = smooth_union(near(rest), far(rest), width)
-    here, step = skin, 1e-4
+    here, step = skin, 2e-5
     for _ in range(_STEPS):
-        shifts = step * np.eye(3)
-        slope = np.stack([bent(here + s) - bent(here - s) for s in shifts], 1) / (2 * step)
+        value = bent(here)
+        slope = np.stack([bent(here + shift) - value for shift in step * np.eye(3)], 1) / step
         square = np.maximum((slope * slope).sum(1), 0.25)
-        miss = np.clip(0.7 * (bent(here) - height) / square, -0.0015, 0.0015)
+        miss = np.clip(0.7 * (value - height) / square, -0.0015, 0.0015)
         here = here - slope * miss[:, None]
     return here - skin

@@ -23,16 +23,25 @@ class AttachedSurfels:
     """Surfels [...,N] of posed meshes: ``means`` [...,N,3], ``tangents`` [...,N,2,3], ``normals`` [...,N,3].
 
     The disk's points are mean + u tangent_0 + v tangent_1 with weight exp(-(u^2 + v^2) / 2); normals face
-    outward.
+    outward. With ``ratios`` [K] the surfels come in groups of K whose tangents are a common pair's times
+    these: the small triangles of one face are alike. Leave it out once tangents are changed or rows chosen.
     """
 
     means: Tensor
     tangents: Tensor
     normals: Tensor
+    ratios: Tensor | None = None
 
     def scales_quats(self) -> tuple[Tensor, Tensor]:
         """Standard deviations [...,N,2] along the principal axes and their rotation, quats [...,N,4] wxyz."""
-        return principal_scales_quats(self.tangents[..., 0, :], self.tangents[..., 1, :])
+        if self.ratios is None or len(self.ratios) == 1:
+            return principal_scales_quats(self.tangents[..., 0, :], self.tangents[..., 1, :])
+        # One eigen-problem a group; its first member is the face itself.
+        count = len(self.ratios)
+        whole = self.tangents[..., ::count, :, :]
+        scales, quats = principal_scales_quats(whole[..., 0, :], whole[..., 1, :])
+        scales = (scales.unsqueeze(-2) * self.ratios.to(scales).unsqueeze(-1)).flatten(-3, -2)
+        return scales, quats.repeat_interleave(count, -2)
 
 
 @dataclass(frozen=True)
@@ -50,6 +59,7 @@ class MeshBinding:
     per_face: int
     surfel_faces: Tensor
     bones: Tensor
+    ratios: Tensor  # [K]: size of each small triangle of a face, the face's own first
     _parts: Tensor  # [9,9 K]: a face's corners (flat) to mean and tangents of each of its small triangles
 
     @staticmethod
@@ -60,6 +70,8 @@ class MeshBinding:
         conjugate = torch.tensor(CONJUGATE)
         conjugate[1:] *= SIGMA_PER_SEMI_AXIS
         # Tangent order (Q, P): their cross product is the outward normal.
+        # Homothetic copies: the length of any edge tells.
+        edges = (corners[:, 1] - corners[:, 0]).norm(dim=-1)
         rows = (conjugate[[0, 2, 1]] @ corners).reshape(-1, 3)
         parts = torch.kron(rows.T.contiguous(), torch.eye(3))
         weights = subdivision.apply(model.weights)
@@ -73,6 +85,7 @@ class MeshBinding:
             count,
             subdivision.face_parent.repeat_interleave(count),
             bones.repeat_interleave(count),
+            edges / edges[0],
             parts,
         )
 
@@ -96,4 +109,4 @@ class MeshBinding:
         normals = normals / safe_norm(normals).unsqueeze(-1)
         # The small triangles of a face lie in its plane.
         normals = normals.unsqueeze(-2).expand(*lead, -1, self.per_face, 3).reshape(*lead, self.count, 3)
-        return AttachedSurfels(both[..., 0, :], both[..., 1:, :], normals)
+        return AttachedSurfels(both[..., 0, :], both[..., 1:, :], normals, self.ratios)

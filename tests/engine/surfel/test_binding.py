@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mass_engine.hand.builtin import load_builtin
 from mass_engine.hand.pose import HandPose
 from mass_engine.hand.poses import named_pose
-from mass_engine.surfel.binding import MeshBinding
+from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
 from mass_engine.surfel.densify import SURFELS_PER_FACE, fractal_corners
 from mass_engine.surfel.inellipse import SIGMA_PER_SEMI_AXIS, quat_to_matrix, steiner_inellipse
 
@@ -69,6 +69,18 @@ def test_surfels_are_the_inellipses_of_the_small_triangles(levels: int, depth: i
     one, two = (a @ a.mT for a in (axes[0], axes[1] * SIGMA_PER_SEMI_AXIS))
     assert float((one - two).abs().max() / two.abs().max()) < 1e-3
     assert torch.allclose(quat_to_matrix(mine)[..., 2], surfels.normals, atol=2e-3)
+
+
+@pytest.mark.parametrize("depth", [0, 1, 2])
+def test_scales_and_quats_by_face_are_those_of_each_surfel(depth: int) -> None:
+    model = load_builtin("right")
+    surfels = MeshBinding.build(model, 1, depth).surfels(model(named_pose("fist", "right"))[0])
+    every = AttachedSurfels(surfels.means, surfels.tangents, surfels.normals)
+    (scales, quats), (one_by_one, turns) = surfels.scales_quats(), every.scales_quats()
+    assert torch.allclose(scales, one_by_one, rtol=1e-3, atol=1e-7)
+    shapes = [quat_to_matrix(q)[..., :2] * s.unsqueeze(-2) for q, s in ((quats, scales), (turns, one_by_one))]
+    one, two = (shape @ shape.mT for shape in shapes)
+    assert float((one - two).abs().max() / two.abs().max()) < 1e-3
 
 
 def test_normals_face_outward_and_faces_are_known() -> None:

@@ -196,7 +196,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     ]
     write(out / "poses.png", np.vstack(rows))
     rows = []
-    for view in ("back", "thumb"):
+    for view in (CloseUp(4, VIEWS["back"], 0.33), CloseUp(4, VIEWS["thumb"], 0.33)):
         for amount in (-3.0, 3.0):
             cells = []
             for place, name in enumerate(SHAPE_NAMES):

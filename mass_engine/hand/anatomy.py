@@ -2,9 +2,10 @@
 
 Right hand at rest: fingers along -x, palm towards -y, thumb towards +z, wrist joint at the origin; metres.
 Segment lengths are the means of Buryanov and Kotiuk (2010, "Proportions of hand segments"); breadths and
-depths lie within the adult ranges of Garrett (1971, "The adult human hand") and Greiner (1991, hand
-anthropometry of U.S. Army personnel). One unit of a shape parameter is about one standard deviation of
-adults; :data:`SHAPE_RANGES` reaches children.
+depths lie within the adult ranges of Garrett (1971, "The adult human hand: some anthropometric and
+biomechanical considerations") and Greiner (1991, "Hand anthropometry of U.S. Army personnel"); nails, webs
+and pads are drawn by eye. The joints' limits and their sources are in :mod:`mass_engine.hand.builtin`. One unit
+of a shape parameter is about one standard deviation of adults; :data:`SHAPE_RANGES` reaches children.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Makes the built-in hand's data file: ``python -m mass_engine.hand.sculpt [OUT]``.
 
 The soft tissue of :mod:`mass_engine.hand.anatomy` is blended into one distance field and meshed once for the
-mean shape. Each shape parameter moves the bones and the field; every vertex follows both, which gives the
-shape space: one topology serves all shapes. Needs the development extra scikit-image.
+mean shape; how joints bend is found by bending that field (:mod:`mass_engine.hand.bending`). Each shape
+parameter moves the bones and the field; every vertex follows both, which gives the shape space: one topology
+serves all shapes. Needs the development extra scikit-image.
 """
 
 from __future__ import annotations

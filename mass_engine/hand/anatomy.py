@@ -4,8 +4,8 @@ Right hand at rest: fingers along -x, palm towards -y, thumb towards +z, wrist j
 Segment lengths are the means of Buryanov and Kotiuk (2010, "Proportions of hand segments"); breadths and
 depths lie within the adult ranges of Garrett (1971, "The adult human hand: some anthropometric and
 biomechanical considerations") and Greiner (1991, "Hand anthropometry of U.S. Army personnel"); nails, webs
-and pads are drawn by eye. The joints' limits and their sources are in :mod:`mass_engine.hand.builtin`. One unit
-of a shape parameter is about one standard deviation of adults; :data:`SHAPE_RANGES` reaches children.
+and pads are drawn by eye. The joints' limits and their sources are in :mod:`mass_engine.hand.builtin`. One
+unit of a shape parameter is about one standard deviation of adults; :data:`SHAPE_RANGES` reaches children.
 """
 
 from __future__ import annotations

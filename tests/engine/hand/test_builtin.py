@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 
 from mass_engine.hand.anatomy import SHAPE_NAMES, SHAPE_RANGES, SHAPE_STEPS, skeleton
 from mass_engine.hand.builtin import DATA_FILE, joint_frames, joint_limits, load_builtin
@@ -47,14 +48,16 @@ def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> int:
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     origin, step = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
     count = 0
-    for face in faces:
+    corners = vertices[faces]
+    centers = corners.mean(1)
+    # Only edges near enough to reach the face at all.
+    reach = np.linalg.norm(corners - centers[:, None], axis=2).max(1) + np.linalg.norm(step, axis=1).max() / 2
+    candidates = cKDTree(origin + step / 2).query_ball_point(centers, reach)
+    for face, chosen in zip(faces, candidates, strict=True):
         a, b, c = vertices[face]
-        low, high = vertices[face].min(0), vertices[face].max(0)
-        near = ((np.minimum(origin, origin + step) <= high) & (np.maximum(origin, origin + step) >= low)).all(
-            1
-        )
-        near &= ~np.isin(edges, face).any(1)
-        if not near.any():
+        near = np.array(chosen, int)
+        near = near[(edges[near][..., None] != face).all((1, 2))]
+        if not len(near):
             continue
         o, d = origin[near], step[near]
         h = np.cross(d, c - a)

@@ -1,6 +1,6 @@
 """How well the built-in hand takes the shape of a hand it was not made from.
 
-``python benchmarks/hand_truth.py CLIP_DIR... [--frames 12]`` fits one shape and a pose per frame to the
+``python benchmarks/hand_truth.py CLIP_DIR... [--frames 96]`` fits one shape and a pose per frame to the
 ground-truth surfaces in CLIP_DIR/truth.npz (vertices [T,V,3] world metres, faces, joints with names) and
 prints the distance between the surfaces, both ways: true vertices to the fitted surface, and fitted vertices
 to the true surface. Only the hand counts: what lies behind the wrist joint is left out.
@@ -216,7 +216,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Fit and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("clips", type=Path, nargs="+")
-    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--frames", type=int, default=96)
     parser.add_argument("--steps", type=int, default=240)
     parser.add_argument("--save", type=Path, help="write the last fit here (.pt), for looking at")
     arguments = parser.parse_args(argv)

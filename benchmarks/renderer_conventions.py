@@ -91,9 +91,7 @@ def main() -> None:
     near = disks([[0.0, 0.0, 0.15], [0.3, 0.0, 1.0]], [[0.02, 0.02], [0.1, 0.1]], [0.0, 0.0], 0.99)
     sheet({c: enlarged(r.alpha, 2, False) for c, r in renders(near, camera).items()}, out / "near.png")
 
-    print(
-        "| surfels on a hand | convention | largest colour difference | pixels off by 1/255 | depth, mm, p99 |"
-    )
+    print("| surfels | convention | largest colour difference | pixels off by 1/255 | depth, mm, p99 |")
     print("|---|---|---|---|---|")
     for count in (12_304, 196_864):
         scene = hand_scene(count)

@@ -17,8 +17,8 @@ from mass_engine.raster.cpu import Call
 from mass_engine.raster.types import OPTIMIZATIONS
 
 _REPETITIONS = 15
-#: 512-bit instructions of one (surfel, block) evaluation, counted in the loops g++ 12 makes: only the low-pass
-#: part, the whole. Colour, alpha and depth; the sum over lanes, once a pair, is not in it.
+#: 512-bit instructions of one (surfel, block) evaluation, counted in the loops g++ 12 makes: the low-pass
+#: part alone, the whole. Colour, alpha and depth; the sum over lanes, once a pair, is not in it.
 _INSTRUCTIONS = {"forward": (42, 63), "backward": (57, 110)}
 #: Bytes a surfel brings in (mean, tangents, opacity, colour) and its splat, box and key.
 _INPUT_BYTES, _SPLAT_BYTES = 52, 64 + 8 + 4

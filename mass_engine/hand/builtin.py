@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -36,13 +37,26 @@ def load_builtin(side: Side) -> HandModel:
     """The built-in hand of ``side``; the left one is the right one mirrored."""
     tensors = load_file(DATA_FILE)
     tensors["faces"] = tensors["faces"].long()
-    # 1 - cos(angle) is half of what the diagonal of R - I lacks, whatever the axis.
     bends = tensors.pop("bend_shapes")
-    pose_basis = torch.zeros(*bends.shape, 9)
-    pose_basis[..., [0, 4, 8]] = -0.5 * bends.unsqueeze(-1)
-    tensors["pose_basis"] = pose_basis.flatten(2)
     right = HandModel.from_tensors("right", tensors)
+    right = replace(right, pose_basis=_bend_basis(bends, joint_frames(right)[:, 0]))
     return right if side == "right" else right.mirrored()
+
+
+def _bend_basis(bends: Tensor, axes: Tensor) -> Tensor:
+    """[V,3,135] from the shapes [V,3,15,2] of sin(a) and 1 - cos(a) about each joint's flexion axis [15,3].
+
+    Both are linear in a rotation R: sin(a) along an axis is half of R - R^T there, 1 - cos(a) is half of what
+    the diagonal of R lacks, whatever the axis.
+    """
+    flexes, turns = bends.unbind(-1)
+    x, y, z = (0.5 * axes).T
+    zero = torch.zeros_like(x)
+    of_sine = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    of_cosine = torch.zeros(15, 9)
+    of_cosine[:, [0, 4, 8]] = -0.5
+    basis: Tensor = flexes.unsqueeze(-1) * of_sine + turns.unsqueeze(-1) * of_cosine
+    return basis.flatten(2)
 
 
 def joint_limits() -> Tensor:

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mass_engine.hand.anatomy import STUMP, Tissue, Vector
+from mass_engine.hand.anatomy import STUMP, Nail, Tissue, Vector
 
 #: How far the cut edge is rounded (metres).
-_CUT = 0.010
+_CUT = 0.012
+#: Width (metres) of the step at a nail's rim.
+_RIM = 0.0008
 
 
 def smooth_union(a: Vector, b: Vector, width: float) -> Vector:
@@ -45,11 +47,53 @@ def tissue_distance(points: Vector, tissue: Tissue) -> Vector:
     side = np.cross(along, back)
     x, y, z = offset @ along, offset @ side, offset @ back
     height = section[:, 2] + (section[:, 1] - section[:, 2]) / (1 + np.exp(-6 * z / section[:, 1]))
-    scaled = np.stack([x / tissue.tip, y / section[:, 0], z / height], 1)
+    ends = np.where(x < 0, tissue.tip if tissue.root is None else tissue.root, tissue.tip)
+    sizes = np.stack([ends, section[:, 0], height], 1)
+    scaled = np.stack([x, y, z], 1) / sizes
     length = np.linalg.norm(scaled, axis=1)
-    slope = np.linalg.norm(scaled / np.stack([np.full_like(x, tissue.tip), section[:, 0], height], 1), axis=1)
+    slope = np.linalg.norm(scaled / sizes, axis=1)
     inner = -np.minimum(section[:, 0], height)
-    return np.asarray(np.where(length > 1e-3, length * (length - 1) / np.maximum(slope, 1e-9), inner))
+    apart = np.where(length > 1e-3, length * (length - 1) / np.maximum(slope, 1e-9), inner)
+    return np.asarray(apart if tissue.nail is None else apart - nail_relief(points, tissue.nail))
+
+
+def nail_distance(points: Vector, nail: Nail) -> Vector:
+    """About how far [P] (metres) ``points`` [P,3] lie outside the nail's outline; the other side is far."""
+    s, t, up = _on_nail(points, nail)
+    rim = ((s**4 + t**4) ** 0.25 - 1) * nail.breadth
+    return np.asarray(np.hypot(np.maximum(rim, 0.0), np.maximum(0.0, -up - 0.001) * 3))
+
+
+def nail_relief(points: Vector, nail: Nail) -> Vector:
+    """Height [P] (metres) of the plate over the skin at ``points`` [P,3], negative in the fold around it."""
+    s, t, up = _on_nail(points, nail)
+    # Distance to the outline, a rounded rectangle.
+    rim = ((s**4 + t**4) ** 0.25 - 1) * nail.breadth
+    plate = 1 / (1 + np.exp(np.clip((rim - _RIM) / (0.35 * _RIM), -40, 40)))
+    # The fold runs round three sides; the end is free.
+    fold = np.exp(-(((rim - 2.8 * _RIM) / (2.2 * _RIM)) ** 2)) / (1 + np.exp(np.clip(8 * (s - 0.5), -40, 40)))
+    above = 1 / (1 + np.exp(np.clip(-up / 0.0006, -40, 40)))
+    return np.asarray(nail.height * (plate - 0.3 * fold * (1 - plate)) * above)
+
+
+def to_outline(points: Vector, nail: Nail) -> Vector:
+    """``points`` [P,3] with those near the nail's outline moved onto it, so that edges run along it."""
+    s, t, up = _on_nail(points, nail)
+    out = np.maximum((s**4 + t**4) ** 0.25, 1e-6)
+    near = (np.abs(out - 1) * nail.breadth < 1.3 * _RIM) & (up > 0)
+    change = np.where(near, 1 / out - 1, 0.0)
+    return np.asarray(
+        points
+        + np.outer(change * s, nail.along) * nail.length
+        + np.outer(change * t, nail.across) * nail.breadth
+    )
+
+
+def _on_nail(points: Vector, nail: Nail) -> tuple[Vector, Vector, Vector]:
+    """Place along and across the nail, its ends at -1 and 1, and height (metres) over the bone."""
+    offset = points - nail.middle
+    up = offset @ np.cross(nail.across, nail.along)
+    return offset @ nail.along / nail.length, offset @ nail.across / nail.breadth, up
 
 
 def distance_field(points: Vector, tissues: Sequence[Tissue]) -> Vector:

@@ -36,6 +36,15 @@ def remesh(
                 break
         for _ in range(3):
             vertices = project(_relaxed(vertices, faces))
+    # What the last projection brought too near to each other.
+    for _ in range(6):
+        vertices, faces, changed = _collapse(vertices, faces, size, short=0.75, long=2.0)
+        if not changed:
+            break
+    for _ in range(4):
+        faces, changed = _flip(vertices, faces, by_angle=True)
+        if not changed:
+            break
     return vertices, faces
 
 
@@ -80,7 +89,13 @@ def _split(vertices: Vector, faces: Faces, size: Callable[[Vector], Vector]) -> 
     return np.concatenate([vertices, np.array(added)]), np.array(rows, np.int64), True
 
 
-def _collapse(vertices: Vector, faces: Faces, size: Callable[[Vector], Vector]) -> tuple[Vector, Faces, bool]:
+def _collapse(
+    vertices: Vector,
+    faces: Faces,
+    size: Callable[[Vector], Vector],
+    short: float = 4 / 5,
+    long: float = 4 / 3,
+) -> tuple[Vector, Faces, bool]:
     sides = edge_faces(faces)
     edges = list(sides)
     ratio = _by_length(vertices, edges, size)
@@ -97,7 +112,7 @@ def _collapse(vertices: Vector, faces: Faces, size: Callable[[Vector], Vector]) 
     merged = np.arange(len(vertices))
     vertices = vertices.copy()
     for number in np.argsort(ratio, kind="stable"):
-        if ratio[number] >= 4 / 5:
+        if ratio[number] >= short:
             break
         a, b = edges[number]
         near = ring[a] | ring[b]
@@ -106,7 +121,7 @@ def _collapse(vertices: Vector, faces: Faces, size: Callable[[Vector], Vector]) 
             continue
         middle = (vertices[a] + vertices[b]) / 2
         others = list(near - {a, b})
-        if (np.linalg.norm(vertices[others] - middle, axis=1) > 4 / 3 * wanted[others]).any():
+        if (np.linalg.norm(vertices[others] - middle, axis=1) > long * wanted[others]).any():
             continue
         kept = [f for f in {*around[a], *around[b]} if f not in sides[a, b]]
         before = vertices[faces[kept]]
@@ -134,8 +149,8 @@ def _turned(before: Vector, after: Vector) -> bool:
     return bool(((_normals(before) * _normals(after)).sum(1) < 0.5).any())
 
 
-def _flip(vertices: Vector, faces: Faces) -> tuple[Faces, bool]:
-    """Turn edges so that more vertices have six neighbours."""
+def _flip(vertices: Vector, faces: Faces, by_angle: bool = False) -> tuple[Faces, bool]:
+    """Turn edges so that more vertices have six neighbours, or so that the angles across become less wide."""
     sides = edge_faces(faces)
     degree = np.bincount(faces.ravel(), minlength=len(vertices))
     rows = faces.copy()
@@ -151,9 +166,11 @@ def _flip(vertices: Vector, faces: Faces) -> tuple[Faces, bool]:
         across = (c, d) if c < d else (d, c)
         if across in sides or across in made:
             continue
+        if by_angle and _angle(vertices, c, a, b) + _angle(vertices, d, a, b) < np.pi * 1.05:
+            continue
         old = sum((degree[v] - 6) ** 2 for v in (a, b, c, d))
         new = sum((degree[v] - 7) ** 2 for v in (a, b)) + sum((degree[v] - 5) ** 2 for v in (c, d))
-        if new >= old or degree[a] <= 4 or degree[b] <= 4:
+        if (new >= old and not by_angle) or degree[a] <= 4 or degree[b] <= 4:
             continue
         # Keep the winding: walk from a to b in the first face.
         if one[(one.index(a) + 1) % 3] != b:
@@ -169,6 +186,12 @@ def _flip(vertices: Vector, faces: Faces) -> tuple[Faces, bool]:
         changed = True
         made.add(across)
     return rows, changed
+
+
+def _angle(vertices: Vector, at: int, a: int, b: int) -> float:
+    """The angle (radians) at one vertex between two others."""
+    u, v = vertices[a] - vertices[at], vertices[b] - vertices[at]
+    return float(np.arccos(np.clip(u @ v / np.sqrt((u @ u) * (v @ v)), -1.0, 1.0)))
 
 
 def _relaxed(vertices: Vector, faces: Faces) -> Vector:

@@ -1,8 +1,9 @@
 """Makes the built-in hand's data file: ``python -m mass_engine.hand.sculpt [OUT]``.
 
 The soft tissue of :mod:`mass_engine.hand.anatomy` is blended into one distance field and meshed once for the
-mean shape. Each shape parameter moves the bones and the field; every vertex follows both, which gives the
-shape space: one topology serves all shapes. Needs the development extra scikit-image.
+mean shape; how joints bend is found by bending that field (:mod:`mass_engine.hand.bending`). Each shape
+parameter moves the bones and the field; every vertex follows both, which gives the shape space: one topology
+serves all shapes. Needs the development extra scikit-image.
 """
 
 from __future__ import annotations
@@ -27,16 +28,24 @@ from mass_engine.hand.anatomy import (
     skeleton,
     soft_tissue,
 )
+from mass_engine.hand.bending import bend_shapes
 from mass_engine.hand.builtin import DATA_FILE
-from mass_engine.hand.field import distance_field, field_gradient, project, tissue_distance
+from mass_engine.hand.field import (
+    distance_field,
+    field_gradient,
+    nail_distance,
+    project,
+    tissue_distance,
+    to_outline,
+)
 from mass_engine.hand.remesh import remesh
-from mass_engine.hand.skinning import Faces, bend_shapes, neighbour_mean, skinning_weights
+from mass_engine.hand.skinning import Faces, neighbour_mean, skinning_weights
 from mass_engine.surfel.subdivision import loop_subdivision
 
 _CELL = 0.003  # marching-cubes cell, metres
 _LOW, _HIGH = (-0.215, -0.060, -0.085), (0.045, 0.045, 0.115)
-#: Wanted edge length (metres) on the palm, on the digits and at their tips.
-_COARSE, _FINE, _TIP = 0.0088, 0.0057, 0.0046
+#: Wanted edge length (metres) on the palm, on the digits, at their tips and on the nails.
+_COARSE, _FINE, _TIP, _NAIL = 0.0089, 0.0059, 0.0043, 0.0028
 
 
 def _mesh(tissues: Sequence[Tissue]) -> tuple[Vector, Faces]:
@@ -53,6 +62,7 @@ def _mesh(tissues: Sequence[Tissue]) -> tuple[Vector, Faces]:
     if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
         faces = faces[:, ::-1].copy()
     digits = [part for part in tissues if part.group in FIRST_JOINT]
+    nails = [part.nail for part in digits if part.nail is not None]
     tips = skeleton(np.zeros(len(SHAPE_NAMES)))[list(TIP_POINT.values())]
 
     def size(points: Vector) -> Vector:
@@ -60,23 +70,28 @@ def _mesh(tissues: Sequence[Tissue]) -> tuple[Vector, Faces]:
         coarse = np.clip(apart / 0.012, 0.0, 1.0)
         tip = np.linalg.norm(points[:, None] - tips, axis=-1).min(1)
         fine = _TIP + (_FINE - _TIP) * np.clip((tip - 0.008) / 0.012, 0.0, 1.0)
+        nail = np.stack([nail_distance(points, nail) for nail in nails]).min(0)
+        fine = _NAIL + (fine - _NAIL) * np.clip((nail - 0.0015) / 0.004, 0.0, 1.0)
         rim = np.clip((STUMP - 0.002 - points[:, 0]) / 0.012, 0.0, 1.0)
         return np.asarray(_FINE + (fine + (_COARSE - fine) * coarse - _FINE) * rim)
 
-    return remesh(vertices, faces, size, lambda points: project(points, tissues, steps=1))
+    def onto(points: Vector) -> Vector:
+        for nail in nails:
+            points = to_outline(points, nail)
+        return project(points, tissues, steps=1)
+
+    return remesh(vertices, faces, size, onto)
 
 
 def _cage(vertices: Vector, faces: Faces, tissues: Sequence[Tissue]) -> Vector:
     """Vertices whose Loop-subdivided surface, not the coarse mesh itself, lies on the hand's surface."""
     twice = loop_subdivision(torch.from_numpy(faces), len(vertices), 2)
-    # The cut of the forearm is sharper than the mesh can follow; there the mesh stays as it is.
-    free = np.clip((STUMP - 0.004 - vertices[:, 0]) / 0.004, 0.0, 1.0)
     for _ in range(12):
         # Subdivision keeps the old vertices first.
         smooth = twice.apply(torch.from_numpy(vertices).float()).double().numpy()[: len(vertices)]
         slope = field_gradient(smooth, tissues)
         slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
-        vertices = vertices - 0.7 * slope * (free * distance_field(smooth, tissues))[:, None]
+        vertices = vertices - 0.7 * slope * distance_field(smooth, tissues)[:, None]
     return vertices
 
 
@@ -125,11 +140,11 @@ def sculpt() -> dict[str, NDArray[np.generic]]:
     tissues, points = soft_tissue(mean), skeleton(mean)
     vertices, faces = _mesh(tissues)
     weights = skinning_weights(vertices, faces, points)
-    bends = bend_shapes(vertices, faces, points, weights)
-    vertices = _cage(vertices, faces, tissues)
-    of_vertices, of_points = _shape_basis(vertices, faces, weights)
+    cage = _cage(vertices, faces, tissues)
+    bends = bend_shapes(vertices, cage, faces, points, weights, tissues)
+    of_vertices, of_points = _shape_basis(cage, faces, weights)
     return {
-        "template": vertices.astype(np.float32),
+        "template": cage.astype(np.float32),
         "faces": faces.astype(np.int32),
         "shape_basis": of_vertices.astype(np.float32),
         "joint_template": points.astype(np.float32),

@@ -1,11 +1,10 @@
-"""Which bone moves which part of the skin, and how the skin keeps its volume when a joint bends."""
+"""Which bone moves which part of the skin."""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from mass_engine.hand.anatomy import DIGITS, FINGERS, FIRST_JOINT, THUMB_BACK, Vector, digit_line
 
@@ -16,8 +15,6 @@ _FINGER_BANDS, _THUMB_BANDS = (0.0115, 0.0075, 0.0065), (0.0170, 0.0105, 0.0080)
 #: The crease under a knuckle lies farther out than the knuckle: metres along per metre below the bone.
 _CREASE = 0.45
 _SMOOTHING = 3
-#: Angle (radians) at which the volume is exactly kept; how far a bent joint's corner stands out (metres).
-_BEND, _CORNER = np.pi / 2, 0.0009
 
 
 def neighbour_mean(faces: Faces, count: int) -> sp.csr_array:
@@ -88,51 +85,3 @@ def skinning_weights(vertices: Vector, faces: Faces, points: Vector) -> Vector:
         weights = 0.5 * weights + 0.5 * (average @ weights)
     weights[weights < 0.004] = 0.0
     return np.asarray(weights / weights.sum(1, keepdims=True))
-
-
-def bend_shapes(vertices: Vector, faces: Faces, points: Vector, weights: Vector) -> Vector:
-    """Change of the rest vertices [V,3,15] per unit of 1 - cos(angle) of each finger joint.
-
-    Plain skinning averages positions, so the skin across a bent joint comes nearer to it: a quarter turn
-    loses 30 % of the radius. What is added here puts it back where it would be if the *angle* were averaged.
-    Blending by w takes r (1 - sqrt(1 - 2 w (1 - w) (1 - cos a))), to first order linear in 1 - cos a.
-    """
-    shapes = np.zeros((len(vertices), 3, 15))
-    for digit in DIGITS:
-        line = digit_line(points, digit)
-        back = back_of(digit, line)
-        for k in range(3):
-            joint = FIRST_JOINT[digit] + k
-            moved = weights[:, joint : FIRST_JOINT[digit] + 3].sum(1)
-            # The part of the vertex that moves with neither side of this joint is not its business.
-            own = moved + weights[:, joint - 1] if k else moved + weights[:, 0]
-            along = (line[k + 1] - line[k]) / np.linalg.norm(line[k + 1] - line[k])
-            axis = np.cross(back, along)
-            share = np.where(own > 1e-3, moved / np.maximum(own, 1e-3), 0.0)
-            arm = vertices - line[k]
-            arm -= axis * (arm @ axis)[:, None]
-            turned = Rotation.from_rotvec(axis * _BEND).apply(arm)
-            blended = (1 - share[:, None]) * arm + share[:, None] * turned
-            kept = np.stack(
-                [Rotation.from_rotvec(axis * _BEND * s).apply(a) for s, a in zip(share, arm, strict=True)]
-            )
-            corner = (
-                4
-                * share
-                * (1 - share)
-                * np.maximum(0.0, (arm @ back) / np.linalg.norm(arm, axis=1).clip(1e-6))
-            )
-            kept += (
-                kept / np.linalg.norm(kept, axis=1, keepdims=True).clip(1e-6) * (_CORNER * corner)[:, None]
-            )
-            # Undo the blended rotation to know the change at rest. The inner side folds: leave it be.
-            matrix = (1 - share)[:, None, None] * np.eye(3) + share[:, None, None] * Rotation.from_rotvec(
-                axis * _BEND
-            ).as_matrix()
-            change = np.linalg.solve(matrix, (kept - blended)[..., None])[..., 0]
-            inner = _step((arm @ back) / 0.004)
-            near = _step((0.026 - np.linalg.norm(vertices - line[k], axis=1)) / 0.006)
-            shapes[..., joint - 1] = change * (inner * near * own)[:, None]
-    average = neighbour_mean(faces, len(vertices))
-    flat = shapes.reshape(len(vertices), -1)
-    return np.asarray((0.5 * flat + 0.5 * (average @ flat)).reshape(shapes.shape))

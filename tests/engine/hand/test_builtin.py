@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 
 from mass_engine.hand.anatomy import SHAPE_NAMES, SHAPE_RANGES, SHAPE_STEPS, skeleton
 from mass_engine.hand.builtin import DATA_FILE, joint_frames, joint_limits, load_builtin
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose, Side
+from mass_engine.surfel.subdivision import Subdivision, loop_subdivision
 
 SIDES: tuple[Side, ...] = ("right", "left")
 
@@ -44,14 +48,16 @@ def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> int:
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     origin, step = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
     count = 0
-    for face in faces:
+    corners = vertices[faces]
+    centers = corners.mean(1)
+    # Only edges near enough to reach the face at all.
+    reach = np.linalg.norm(corners - centers[:, None], axis=2).max(1) + np.linalg.norm(step, axis=1).max() / 2
+    candidates = cKDTree(origin + step / 2).query_ball_point(centers, reach)
+    for face, chosen in zip(faces, candidates, strict=True):
         a, b, c = vertices[face]
-        low, high = vertices[face].min(0), vertices[face].max(0)
-        near = ((np.minimum(origin, origin + step) <= high) & (np.maximum(origin, origin + step) >= low)).all(
-            1
-        )
-        near &= ~np.isin(edges, face).any(1)
-        if not near.any():
+        near = np.array(chosen, int)
+        near = near[(edges[near][..., None] != face).all((1, 2))]
+        if not len(near):
             continue
         o, d = origin[near], step[near]
         h = np.cross(d, c - a)
@@ -77,15 +83,16 @@ def test_crossing_faces_finds_a_crossing() -> None:
     )
 
 
-def test_no_self_intersection_at_rest_over_the_range_of_adults() -> None:
+def test_no_self_intersection_at_rest_over_the_whole_range() -> None:
     model = load_builtin("right")
     faces = model.faces.numpy()
-    for place in range(-1, 10):
-        betas = torch.zeros(10)
-        if place >= 0:
-            betas[place] = 2.0 if place != 5 else 1.5
-        shaped = (model.template + model.shape_basis @ betas).double().numpy()
-        assert crossing_faces(shaped, faces) == 0, SHAPE_NAMES[place] if place >= 0 else "mean"
+    assert crossing_faces(model.template.double().numpy(), faces) == 0
+    for place, name in enumerate(SHAPE_NAMES):
+        for value in SHAPE_RANGES[place]:
+            betas = torch.zeros(10)
+            betas[place] = value
+            shaped = (model.template + model.shape_basis @ betas).double().numpy()
+            assert crossing_faces(shaped, faces) == 0, (name, value)
 
 
 def test_rest_frame_is_mano_like() -> None:
@@ -139,6 +146,97 @@ def test_a_right_angle_keeps_the_back_of_the_joint_round(joint: int) -> None:
     without = HandModel.from_tensors("right", {k: v for k, v in model.tensors().items() if k != "pose_basis"})
     plain = (without(pose)[0][above] - joints[joint]).norm(dim=1)
     assert float((after / before).min()) > float((plain / before).min())
+
+
+def refined_volume(model: HandModel, pose: HandPose, of: torch.Tensor, fine: Subdivision) -> float:
+    """Volume (cubic metres) of the subdivided surface."""
+    vertices, _ = model(pose)
+    return float(trimesh.Trimesh(fine.apply(vertices).double().numpy(), of.numpy(), process=False).volume)
+
+
+@pytest.mark.parametrize("joint", [2, 3, 5, 6, 8, 9, 11, 12, 15])
+def test_a_right_angle_keeps_the_volume_of_the_joint(joint: int) -> None:
+    """Of the flesh around the joint (a ball of one finger breadth) at most 15 % is lost or won."""
+    model = load_builtin("right")
+    fine = loop_subdivision(model.faces, len(model.template), 1)
+    fingers = torch.zeros(15, 3)
+    fingers[joint - 1] = joint_frames(model)[joint - 1, 0] * (np.pi / 2)
+    pose = replace(HandPose.rest("right"), hand_pose=fingers.flatten())
+    plain = replace(model, pose_basis=None)
+    rest, plain_bent, bent = (
+        refined_volume(*case, fine.faces, fine)
+        for case in ((model, HandPose.rest("right")), (plain, pose), (model, pose))
+    )
+    around = 4 / 3 * np.pi * 0.010**3
+    assert abs(bent - rest) < 0.15 * around
+    assert abs(bent - rest) < 0.4 * abs(plain_bent - rest)
+
+
+@pytest.mark.parametrize("joint", [1, 4, 10, 7, 2, 5, 8, 11])
+def test_bending_shapes_vanish_at_rest_and_grow_without_jumps(joint: int) -> None:
+    model = load_builtin("right")
+    axis = joint_frames(model)[joint - 1, 0]
+    plain = replace(model, pose_basis=None)
+    before = torch.zeros(())
+    for degrees in range(0, 111, 10):
+        fingers = torch.zeros(15, 3)
+        fingers[joint - 1] = axis * np.radians(degrees)
+        pose = replace(HandPose.rest("right"), hand_pose=fingers.flatten())
+        added = (model(pose)[0] - plain(pose)[0]).norm(dim=1).max()
+        if degrees == 0:
+            assert float(added) < 1e-7
+        assert float(added - before) < 0.0025
+        before = added
+    assert 0.001 < float(before) < 0.012
+
+
+@pytest.mark.parametrize(("joint", "tip"), [(3, 17), (6, 18), (12, 19), (9, 20), (15, 16)])
+def test_nails_are_raised_plates(joint: int, tip: int) -> None:
+    """Along the middle of a digit's back the nail stands over the line from behind it to its free end."""
+    model = load_builtin("right")
+    fine = loop_subdivision(model.faces, len(model.template), 3)
+    arm = (fine.apply(model.template) - model.joint_template[tip]) @ joint_frames(model)[joint - 1].T
+    arm = arm[(arm[:, 0].abs() < 0.0012) & (arm[:, 1] > 0) & (arm.norm(dim=1) < 0.024)] * 1e3
+    places = torch.arange(-21.0, -3.0)
+    near = [(arm[:, 2] - place).abs() < 0.6 for place in places]
+    heights = torch.stack([arm[here, 1].mean() for here in near])
+    line = torch.lerp(heights[0], heights[-1], torch.linspace(0, 1, len(places)))
+    assert float((heights - line).max()) > 0.2  # millimetres; without nails less than 0.1
+
+
+def girths(vertices: np.ndarray) -> dict[str, float]:
+    """Some outer measures (metres) of a resting hand's vertices."""
+    x, y, z = vertices.T
+    size = -x.min() / 0.188
+    knuckles = (np.abs(x + 0.085 * size) < 0.006 * size) & (z < 0.045 * size)
+    middle = (np.abs(x + 0.060 * size) < 0.008 * size) & (np.abs(z) < 0.006 * size)
+    return {
+        "length": -float(x.min()),
+        "breadth": float(np.ptp(z[knuckles])),
+        "thickness": float(np.ptp(y[middle])),
+    }
+
+
+def test_the_mean_hand_is_average() -> None:
+    """Between the means of women and men (Garrett 1971, Greiner 1991)."""
+    mean = girths(load_builtin("right").template.double().numpy())
+    assert 0.180 < mean["length"] < 0.194
+    assert 0.078 < mean["breadth"] < 0.090
+    assert 0.026 < mean["thickness"] < 0.034
+
+
+def test_the_size_covers_children_and_tall_adults() -> None:
+    """Hand length from about six years of age (0.13 m) to beyond the 99th percentile of men (0.215 m)."""
+    model = load_builtin("right")
+    lengths = []
+    for value in SHAPE_RANGES[0]:
+        betas = torch.zeros(10)
+        betas[0] = value
+        lengths.append(girths((model.template + model.shape_basis @ betas).double().numpy())["length"])
+    assert lengths[0] < 0.13
+    assert lengths[1] > 0.215
+    for low, high in SHAPE_RANGES:
+        assert low < 0 < high
 
 
 def test_shape_parameters_do_what_their_names_say() -> None:

@@ -50,6 +50,31 @@ def test_named_poses_look_like_their_names(side: Side) -> None:
     assert (gaps[1] > gaps[0] + 0.005).all()
 
 
+@pytest.mark.parametrize(
+    ("name", "tip", "reach"),
+    [("fist", 17, 0.006), ("fist", 18, 0.006), ("fist", 19, 0.006), ("fist", 20, 0.006)],
+)
+def test_the_fist_is_closed(name: str, tip: int, reach: float) -> None:
+    """Each fingertip touches the palm, and no bone of it lies under the palm's skin."""
+    model = load_builtin("right")
+    vertices, points = model(named_pose(name, "right"))
+    bone = model.weights.argmax(1)
+    palm = vertices[(bone == 0) | (bone == 13)]
+    last = {17: 3, 18: 6, 19: 12, 20: 9}[tip]
+    assert float(torch.cdist(vertices[bone == last], palm).min()) < reach
+    assert float((palm - points[last]).norm(dim=1).min()) > 0.004
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_the_thumb_reaches_the_little_finger(side: Side) -> None:
+    model = load_builtin(side)
+    vertices, points = model(named_pose("oppose", side))
+    bone = model.weights.argmax(1)
+    assert float(torch.cdist(vertices[bone == 15], vertices[bone == 9]).min()) < 0.004
+    # The pads meet, not the nails: the thumb's tip lies on the palm's side of the little finger's last joint.
+    assert points[16, 1] < points[9, 1] + 0.005
+
+
 def test_left_poses_mirror_right_ones() -> None:
     flip = torch.tensor([-1.0, 1.0, 1.0])
     for name in POSE_NAMES:

@@ -231,7 +231,7 @@ def test_too_many_triangles_are_refused_with_what_to_do(
 ) -> None:
     path = write_glb(tmp_path / "hand.glb", builtin_rig())
     monkeypatch.setattr(gltf, "MOST_FACES", 2000)
-    with pytest.raises(EngineError, match="2328 triangles") as caught:
+    with pytest.raises(EngineError, match=f"{len(builtin_rig().faces)} triangles") as caught:
         read_rigged_hand(path)
     assert caught.value.code == "template.too_large"
     monkeypatch.setattr(gltf, "MOST_VERTICES", 1000)

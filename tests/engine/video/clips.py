@@ -40,6 +40,8 @@ def encoder(
     path: Path, codec: str, height: int, width: int, pix_fmt: str = "yuv420p", **options: str
 ) -> Iterator[tuple[av.container.OutputContainer, VideoStream]]:
     """An open container with one video stream in milliseconds; flushed and closed on leaving."""
+    if codec == "libx265":  # its reordered frames reach the muxer without a decoding time now and then
+        options.setdefault("x265-params", "bframes=0:log-level=error")
     flags = {"movflags": options.pop("movflags")} if "movflags" in options else {}
     with av.open(str(path), "w", options=flags) as container:
         stream = container.add_stream(codec, rate=25, options=options)

@@ -211,7 +211,7 @@ def _view(
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
         labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), np.uint8)
         view_camera = view_camera.resized(*size)
-    return View(mark.index, time, heldout, rgb, labels, view_camera, mark.points, mark.score)
+    return View(mark.index, time, heldout, rgb, labels, view_camera, mark.points, mark.score, mark.at_joints)
 
 
 def _user_mask(directory: Path, index: int, box: tuple[int, int, int, int], camera: Camera) -> HandMask:

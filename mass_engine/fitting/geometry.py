@@ -15,12 +15,20 @@ from torch import Tensor
 from mass_engine.camera import Camera
 from mass_engine.fitting import losses
 from mass_engine.fitting.poses import PoseTable
-from mass_engine.fitting.subject import Appearance, Shape, mesh_edges, pose_surfels, render_row
+from mass_engine.fitting.subject import (
+    Appearance,
+    PosedSurfels,
+    Shape,
+    mesh_edges,
+    pose_surfels,
+    render_row,
+)
 from mass_engine.fitting.views import View
 from mass_engine.hand.builtin import joint_frames, joint_limits
 from mass_engine.raster import RasterOptions
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.tracking.alignment import hand_size_pixels, limit_excess
+from mass_engine.tracking.offsets import tracked_points
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,7 @@ class GeometryFit:
         self._points = torch.stack([torch.from_numpy(view.points) for view in views])
         self._sizes = hand_size_pixels(self._points)
         self._scores = torch.tensor([view.score for view in views])
+        self._at_joints = torch.tensor([view.at_joints for view in views])
         self._times = torch.tensor([view.time for view in views], dtype=torch.float64)
         trained = [row for row, view in enumerate(views) if not view.heldout]
         self._trained = torch.tensor(trained)
@@ -176,7 +185,7 @@ class GeometryFit:
                 cover = level.hand.unsqueeze(-1)
                 target = level.rgb * cover + background * (1 - cover)
                 total = total + w.color * losses.photometric(out.rgb, target, level.colored, area)
-        total = total + self._pose_terms(w, rows, leaves, surfels.joints) * len(rows)
+        total = total + self._pose_terms(w, rows, leaves, surfels) * len(rows)
         total = total / len(rows)
         if stage.shared:
             d = self.shape.displacement
@@ -186,10 +195,12 @@ class GeometryFit:
         return total
 
     def _pose_terms(
-        self, w: GeometryWeights, rows: Tensor, leaves: dict[str, Tensor], joints: Tensor
+        self, w: GeometryWeights, rows: Tensor, leaves: dict[str, Tensor], surfels: PosedSurfels
     ) -> Tensor:
         """Landmarks, joint limits and smoothness in time, averaged over the batch."""
-        pixels = (self.camera.project(joints) - self._points[rows]).norm(dim=-1)
+        joints, side = surfels.joints, self.shape.model.side
+        marks = tracked_points(joints, surfels.bone_rotations, side, self._at_joints[rows])
+        pixels = (self.camera.project(marks) - self._points[rows]).norm(dim=-1)
         apart = losses.charbonnier(pixels / self._sizes[rows, None], 0.03).mean(-1) * self._scores[rows]
         excess = limit_excess(leaves["hand_pose"], self._limits, self._frames).square().sum((-1, -2))
         mix = self._mix[rows].view(-1, 1, 1)

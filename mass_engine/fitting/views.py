@@ -64,6 +64,7 @@ class View:
     camera: Camera
     points: NDArray[np.float32]  # [21,2] pixels of the whole picture
     score: float
+    at_joints: bool = False  # the points are a model's joints, not the tracker's
     _levels: dict[int, Level] = field(default_factory=dict, repr=False)
     _outline: Outline | None = field(default=None, repr=False)
 

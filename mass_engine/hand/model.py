@@ -76,10 +76,14 @@ class HandModel:
 
     def joints(self, pose: HandPose) -> Tensor:
         """The 21 points [...,21,3] of ``pose`` alone, without any vertex."""
+        return self.skeleton(pose)[0]
+
+    def skeleton(self, pose: HandPose) -> tuple[Tensor, Tensor]:
+        """The 21 points [...,21,3] and the rotations [...,16,3,3] of the bones from rest, no vertex."""
         self._check(pose)
         rest = self._rest_joints(pose.betas)
         turns, places = _chain(_local_rotations(pose), rest)
-        return _points(turns, places, rest) + pose.transl.unsqueeze(-2)
+        return _points(turns, places, rest) + pose.transl.unsqueeze(-2), turns
 
     def posed(self, pose: HandPose, offsets: Tensor | None = None) -> PosedHand:
         """Pose the hand; ``offsets`` [V,3] or [...,V,3] metres move the rest vertices before skinning."""

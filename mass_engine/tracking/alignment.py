@@ -21,6 +21,7 @@ from mass_engine.hand.builtin import joint_frames, joint_limits
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import JOINT_PARENTS, TIP_PARENTS, HandPose
 from mass_engine.tracking.landmarks import HandLandmarks
+from mass_engine.tracking.offsets import tracked_points
 
 #: Bones as (parent point, child point) over the 21 points.
 BONES: tuple[tuple[int, int], ...] = tuple(
@@ -118,6 +119,7 @@ def align_landmarks(
     points = torch.tensor(np.stack([mark.points for mark in landmarks]), dtype=torch.float32)
     world = torch.tensor(np.stack([mark.world for mark in landmarks]), dtype=torch.float32)
     trust = torch.tensor([mark.score for mark in landmarks], dtype=torch.float32)
+    at_joints = torch.tensor([mark.at_joints for mark in landmarks])
     size = hand_size_pixels(points)
     begin = start if start is not None else initial_pose(model, landmarks, camera)
     parents, children = (torch.tensor(column) for column in zip(*BONES, strict=True))
@@ -155,10 +157,11 @@ def align_landmarks(
         current = pose()
         if finger_share < 1.0:
             current = replace(current, hand_pose=fingers * finger_share)
-        joints = model.joints(current)
-        pixel_error = (camera.project(joints) - points).norm(dim=-1) / size[:, None]
+        joints, turns = model.skeleton(current)
+        marks = tracked_points(joints, turns, model.side, at_joints)
+        pixel_error = (camera.project(marks) - points).norm(dim=-1) / size[:, None]
         robust = w.robust_scale * ((1 + (pixel_error / w.robust_scale) ** 2).sqrt() - 1)
-        direction = torch.nn.functional.normalize(joints[:, children] - joints[:, parents], dim=-1)
+        direction = torch.nn.functional.normalize(marks[:, children] - marks[:, parents], dim=-1)
         cue = 1 - (direction * seen_direction).sum(-1)
         # The image alone cannot tell a finger bent forward from one bent back: the cue decides that first.
         lead = max(0.0, 1 - 2 * iteration / iterations)

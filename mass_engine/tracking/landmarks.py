@@ -44,7 +44,8 @@ class HandLandmarks:
     of :data:`mass_engine.hand.pose.JOINT_NAMES`; ``world`` [21,3] metres, x right, y down, z away from the
     camera, about the hand's middle (a weak cue: bone lengths are not constant); ``score`` the network's
     presence, 0..1; ``right`` its probability that this is a right hand, before any vote over the clip;
-    ``track`` numbers the uninterrupted run of frames; ``trusted`` is False for an outlier.
+    ``track`` numbers the uninterrupted run of frames; ``trusted`` is False for an outlier; ``at_joints`` says
+    that the points are joints of a hand model, not what this tracker sees (:mod:`.offsets`).
     """
 
     index: int
@@ -55,6 +56,7 @@ class HandLandmarks:
     right: float
     track: int = 0
     trusted: bool = True
+    at_joints: bool = False
 
     @property
     def scale(self) -> float:

@@ -152,11 +152,11 @@ def measure(shape: Shape, pose: HandPose, clip: Clip, truth: TruthClip) -> Error
 
 
 def whole(view: View, camera: Camera) -> NDArray[np.uint8]:
-    """The view's labels in the whole picture (background around its crop)."""
+    """The view's labels in the whole picture; around its crop nothing is known: ignored."""
     scale = float(view.camera.K[0, 0] / camera.K[0, 0])
     x, y = (round(float(camera.K[k, 2] - view.camera.K[k, 2] / scale)) for k in (0, 1))
     h, w = (round(n / scale) for n in view.labels.shape)
-    labels = np.zeros((camera.height, camera.width), np.uint8)
+    labels = np.full((camera.height, camera.width), IGNORE, np.uint8)
     crop = cv2.resize(view.labels, (w, h), interpolation=cv2.INTER_NEAREST)
     labels[y : y + h, x : x + w] = crop[: camera.height - y, : camera.width - x]
     return labels

@@ -173,7 +173,7 @@ def _cut_views(
             meter.update("segment", 0.2 * len(crops) / len(marks))
         if frame.index >= last:
             break
-    moved = [replace(mark, points=mark.points - np.array(box[:2], np.float32)) for mark, box, _ in crops]
+    moved = [replace(mark, points=mark.as_read - np.array(box[:2], np.float32)) for mark, box, _ in crops]
     if options.masks is None:
         train = [row for row, (mark, _, _) in enumerate(crops) if not options.is_heldout(mark.index)]
         picked = np.unique(np.linspace(0, len(train) - 1, min(MASK_SAMPLES, len(train))).round().astype(int))

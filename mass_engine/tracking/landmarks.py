@@ -45,7 +45,8 @@ class HandLandmarks:
     camera, about the hand's middle (a weak cue: bone lengths are not constant); ``score`` the network's
     presence, 0..1; ``right`` its probability that this is a right hand, before any vote over the clip;
     ``track`` numbers the uninterrupted run of frames; ``trusted`` is False for an outlier; ``at_joints`` says
-    that the points are joints of a hand model, not what this tracker sees (:mod:`.offsets`).
+    that the points are joints of a hand model, not what this tracker sees (:mod:`.offsets`). ``reading`` is
+    what the network saw where ``points`` were put right (:mod:`.continuity`).
     """
 
     index: int
@@ -57,6 +58,12 @@ class HandLandmarks:
     track: int = 0
     trusted: bool = True
     at_joints: bool = False
+    reading: NDArray[np.float32] | None = None
+
+    @property
+    def as_read(self) -> NDArray[np.float32]:
+        """Points [21,2] as the network saw them: wrong fingers, perhaps, but on the hand's outline."""
+        return self.points if self.reading is None else self.reading
 
     @property
     def scale(self) -> float:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mass_engine.errors import EngineError
 from mass_engine.hand.pose import Side
+from mass_engine.tracking.continuity import FlowRecorder, bridge
 from mass_engine.tracking.landmarks import BONES, HandLandmarks
 from mass_engine.tracking.models import HandNetworks
 from mass_engine.tracking.tracker import HandTracker, TrackerOptions
@@ -60,6 +61,7 @@ class TrackBuilder:
 
     def __init__(self, networks: HandNetworks, options: TrackerOptions | None = None) -> None:
         self._tracker = HandTracker(networks, options)
+        self._flow = FlowRecorder()
         self._found: dict[int, list[HandLandmarks]] = {}
         self._times: list[float] = []
         self._heldout: set[int] = set()
@@ -73,11 +75,13 @@ class TrackBuilder:
         self._size = frame.rgb.shape[1], frame.rgb.shape[0]
         if heldout:
             self._heldout.add(frame.index)
+        else:
+            self._flow.add(frame.rgb, frame.index, hands)
         return hands
 
     def finish(self) -> Track:
         """Choose the main hand. Raises EngineError ``video.no_hand`` or ``video.hand_too_small``."""
-        return main_hand(self._found, self._times, self._heldout, *self._size)
+        return main_hand(self._found, self._times, self._heldout, *self._size, self._flow)
 
 
 def track_main_hand(
@@ -99,8 +103,12 @@ def main_hand(
     heldout: Iterable[int],
     width: int,
     height: int,
+    flow: FlowRecorder | None = None,
 ) -> Track:
-    """Choose the main hand among all ``found`` hands by frame, vote on its side, mark its outliers."""
+    """Choose the main hand among all ``found`` hands by frame, vote on its side, mark its outliers.
+
+    With ``flow`` its landmarks are bridged where they jump and the picture does not.
+    """
     held = frozenset(heldout)
     runs: dict[int, dict[int, HandLandmarks]] = {}
     for index, seen in found.items():
@@ -113,6 +121,8 @@ def main_hand(
     weights = np.array([hand.score for hand in hands.values()])
     right = float((votes * weights).sum() / weights.sum())
     side: Side = "right" if right >= 0.5 else "left"
+    if flow is not None:
+        hands = bridge(hands, flow)
     doubted = _outliers(hands)
     trusted = {i: h for i, h in hands.items() if i not in doubted}
     marked = {i: replace(h, side=side, trusted=i not in doubted) for i, h in hands.items()}

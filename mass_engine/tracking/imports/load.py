@@ -227,7 +227,8 @@ def _place(
         raise invalid("a hand would be behind the camera")
     notes += _summary(track, exact, carried, local + transl[:, None], pixels, K)
     parts = [
-        torch.tensor(part, dtype=torch.float32) for part in (pose.betas, track.orient, track.fingers, transl)
+        torch.tensor(part, dtype=torch.float32)
+        for part in (pose.betas.numpy(), track.orient, track.fingers, transl)
     ]
     tracks = Tracks(
         "",

@@ -49,9 +49,10 @@ def read_arctic(
     side: str,
     size: tuple[int, int],
     mano: Kinematics | None,
+    *,
     undistorted: bool,
-) -> HandTrack:
-    """The hand of ``side`` (auto: right where it is) of the file ``path`` that holds ``values``.
+) -> list[HandTrack]:
+    """The hand of ``side`` (auto: every hand, right first) of the file ``path`` that holds ``values``.
 
     ``numbers`` count rows. Raises EngineError ``tracks.needs_mano``, ``tracks.incomplete``,
     ``tracks.invalid``, ``tracks.no_hand``, ``tracks.other_video``.
@@ -65,10 +66,18 @@ def read_arctic(
     if not is_arctic(values):
         raise invalid("there are no hands with rot, pose, trans and shape")
     held = [name for name in ("right", "left") if isinstance(values.get(name), Mapping)]
-    chosen = cast("Side", held[0] if side == "auto" else side)
-    if chosen not in held:
-        raise no_hand(chosen)
+    if side != "auto" and side not in held:
+        raise no_hand(side)
+    wanted = held if side == "auto" else [side]
+    return [_hand(values, path, cast("Side", name), size, mano, undistorted) for name in wanted]
+
+
+def _hand(
+    values: Any, path: Path, chosen: Side, size: tuple[int, int], mano: Kinematics, undistorted: bool
+) -> HandTrack:
     hand = values[chosen]
+    if not {"rot", "pose", "trans", "shape"} <= hand.keys():
+        raise invalid(f"the {chosen} hand lacks rot, pose, trans or shape")
     rot = numbers(hand["rot"], "rot", (-1, 3))
     count = len(rot)
     pose = numbers(hand["pose"], "pose", (count, 45)) + mano.mean_pose(chosen)

@@ -38,6 +38,8 @@ _MANO_WRIST = np.array([0.0957, 0.0064, 0.0062])
 _LEAST_SEEN = 0.6
 #: Joints of a file further (median, metres) than this from those of its parameters: other conventions.
 _DISAGREE = 0.01
+#: Wrist to the farthest fingertip, metres: less than any child's fist, more than any hand.
+_LENGTHS = (0.03, 0.4)
 _LOOK = "Look at the result with care."
 
 
@@ -71,18 +73,34 @@ def load_tracks(
         own = read_tracks(spec.path, side, size)
         return LoadedTracks(_for_camera(own, assumed) if fov_given else own, True)
     mano = _kinematics(spec, template)
+
+    def one(track: HandTrack) -> LoadedTracks:
+        track, notes = _in_video(track, spec, kind, info.frames)
+        camera_known = track.real and not fov_given
+        K = track.K if camera_known else assumed.K.double().numpy()
+        tracks, placed = _place(track, template, mano, K, size, is_heldout)
+        times = [index / max(info.fps, 1e-6) for index in tracks.indices]
+        tracks = replace(tracks, fps=info.fps, times=times)
+        return LoadedTracks(tracks, camera_known, (*track.notes, *notes, *placed))
+
     if kind == "arctic":
-        track = read_arctic(values, spec.path, side, size, mano, spec.undistorted)
-    elif kind == "harp":
-        track = read_harp(values, side, size, mano)
-    else:
-        track = read_regression(values, side, size)
-    track, notes = _in_video(track, spec, kind, info.frames)
-    camera_known = track.real and not fov_given
-    K = track.K if camera_known else assumed.K.double().numpy()
-    tracks, placed = _place(track, template, mano, K, size, is_heldout)
-    tracks = replace(tracks, fps=info.fps, times=[index / max(info.fps, 1e-6) for index in tracks.indices])
-    return LoadedTracks(tracks, camera_known, (*track.notes, *notes, *placed))
+        return _fuller(one, read_arctic(values, spec.path, side, size, mano, undistorted=spec.undistorted))
+    if kind == "harp":
+        return one(read_harp(values, side, size, mano))
+    return one(read_regression(values, side, size))
+
+
+def _fuller(place: Callable[[HandTrack], LoadedTracks], hands: Sequence[HandTrack]) -> LoadedTracks:
+    """The hand that is in the picture in more frames; the first of equal ones."""
+    placed, errors = [], []
+    for track in hands:
+        try:
+            placed.append(place(track))
+        except EngineError as error:
+            errors.append(error)
+    if not placed:
+        raise errors[0]
+    return max(placed, key=lambda loaded: len(loaded.tracks.indices))
 
 
 def _for_camera(tracks: Tracks, camera: Camera) -> Tracks:
@@ -187,6 +205,15 @@ def _place(
 ) -> tuple[Tracks, list[Note]]:
     model = template.model(track.side).to("cpu", torch.float64)
     track, points, notes = _points(track, model, mano)
+    long = np.linalg.norm(points - points[:, :1], axis=-1).max(1)
+    sound = (long > _LENGTHS[0]) & (long < _LENGTHS[1])
+    if not sound.any():
+        raise invalid(f"its hands are {float(np.median(long)):.3g} m long")
+    if not sound.all():
+        notes.append(
+            ("tracks.frames_dropped", f"{int((~sound).sum())} hands of no sound size left out.", _LOOK)
+        )
+    track, points = track.rows(sound), points[sound]
     pixels = project(points + track.transl[:, None], track.K, track.distortion)
     # A lens model folds what is far outside back into the picture: the pinhole's points must be near, too.
     straight = project(points + track.transl[:, None], track.K)
@@ -222,8 +249,11 @@ def _place(
         betas = torch.zeros(10, dtype=torch.float64)
     pose = replace(pose, betas=betas.expand(len(pixels), 10), transl=torch.zeros_like(pose.transl))
     local = model.joints(pose).numpy() if exact or carried else points
-    transl = solve_translation(local, pixels, K)
-    if (transl[:, 2] + local[..., 2].min(1) <= 0.02).any():
+    try:
+        transl = solve_translation(local, pixels, K)
+    except np.linalg.LinAlgError as error:
+        raise invalid("a hand cannot be placed before this camera") from error
+    if not np.isfinite(transl).all() or (transl[:, 2] + local[..., 2].min(1) <= 0.02).any():
         raise invalid("a hand would be behind the camera")
     notes += _summary(track, exact, carried, local + transl[:, None], pixels, K)
     parts = [

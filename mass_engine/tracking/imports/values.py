@@ -103,12 +103,13 @@ def _npz(data: bytes) -> dict[str, Any]:
 def _npy(data: bytes) -> Any:
     file = io.BytesIO(data)
     version = np.lib.format.read_magic(file)
-    if version == (1, 0):
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    elif version == (2, 0):
-        shape, fortran, dtype = np.lib.format.read_array_header_2_0(file)
-    else:
+    if version not in ((1, 0), (2, 0)):
         raise ValueError(f"npy version {version}")
+    read = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
+    try:
+        shape, fortran, dtype = read(file)
+    except Exception as error:  # the header is a Python literal; its tokenizer has errors of its own
+        raise ValueError(f"its header is broken ({str(error)[:120]})") from error
     rest = data[file.tell() :]
     if dtype.hasobject:
         if dtype.names is not None:

@@ -122,6 +122,7 @@ NPY = {
     "time": npy("{'descr': '<M8[s]', 'fortran_order': False, 'shape': (1,), }", b"x" * 8),
     "version": npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1,), }", b"x" * 8, 9),
     "header": npy("{'descr': __import__('os').system('true')}", b""),
+    "open header": npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1, ", b"x" * 8),
     "long header": npy("(" * 20000, b"", 2),
 }
 
@@ -177,6 +178,8 @@ def spoil(output: dict[str, Any], change: str) -> None:
         del output["box_size"]
     elif change == "not positive":
         output["box_size"] = -output["box_size"]
+    elif change == "hands are .* m long":
+        output["pred_keypoints_3d"] = output["pred_keypoints_3d"] * 1000
     elif change == "several sizes":
         output["img_size"][2] = (320, 240)
     elif change == "a side is called":
@@ -199,6 +202,7 @@ def spoil(output: dict[str, Any], change: str) -> None:
         "betas has shape",
         "pred_cam_t_full, or pred_cam",
         "not positive",
+        "hands are .* m long",
         "several sizes",
         "a side is called",
         "sides are given for",

@@ -343,6 +343,19 @@ def test_arctic_s_rows_and_pictures(tmp_path: Path, mano: Path) -> None:
         load(text, size=(2800, 2000))
 
 
+def test_arctic_s_hand_is_the_one_in_the_picture(tmp_path: Path, template: Template) -> None:
+    arrays: dict[Side, dict[str, Any]] = {"right": arrays_of("right"), "left": arrays_of("left")}
+    poses: dict[Side, Array] = {name: make_clip(arrays[name], name).pose for name in ("right", "left")}
+    path, _, _ = write_arctic(tmp_path, arrays, poses)
+    assert load(path, template, size=(2800, 2000)).tracks.pose.side == "right"
+    hands = np.load(path, allow_pickle=True).item()
+    hands["right"]["trans"] += 5  # metres
+    np.save(path, np.array(hands, object), allow_pickle=True)
+    assert load(path, template, size=(2800, 2000)).tracks.pose.side == "left"
+    with pytest.raises(EngineError, match=r"tracks\.other_video"):
+        load(path, template, "right", size=(2800, 2000))
+
+
 def test_arctic_s_hands_outside_the_picture_are_left_out(tmp_path: Path, template: Template) -> None:
     arrays: dict[Side, dict[str, Any]] = {"right": arrays_of("right")}
     path, _, _ = write_arctic(tmp_path, arrays, {"right": make_clip(arrays["right"], frames=4).pose})

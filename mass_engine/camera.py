@@ -25,6 +25,12 @@ class Camera:
         K = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
         return Camera(K, torch.eye(4), width, height)
 
+    @property
+    def fov_degrees(self) -> float:
+        """Field of view along the longer image side (as far as it is centred)."""
+        focal = float(self.K[0, 0] if self.width >= self.height else self.K[1, 1])
+        return math.degrees(2 * math.atan(0.5 * max(self.width, self.height) / focal))
+
     def project(self, points: Tensor) -> Tensor:
         """World points [...,3] in metres to pixels [...,2]."""
         p = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]

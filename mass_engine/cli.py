@@ -37,7 +37,12 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="builtin|mano:FILE|gltf:FILE",
         help="the hand to start from; after the file ,tips=manopth or ,joints=MAP.json or ,side=left",
     )
-    fit.add_argument("--tracks", type=Path, metavar="FILE", help="use this tracks.json, do not track")
+    fit.add_argument(
+        "--tracks",
+        metavar="[KIND:]PATH",
+        help="use these poses, do not track: tracks.json, or another program's (wilor:, hamer:, arctic:, "
+        "harp:); after the path ,mano=FILE or ,offset=N or ,undistorted=yes",
+    )
     fit.add_argument(
         "--masks", type=Path, metavar="DIR", help="DIR/%%06d.png: 0 background, 128 ignore, 255 hand"
     )

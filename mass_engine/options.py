@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mass_engine.errors import BadArgumentError
 from mass_engine.template_spec import parse_template
+from mass_engine.tracks_spec import parse_tracks
 
 PRESETS = ("draft", "auto", "full")
 SIDES = ("auto", "left", "right")
@@ -17,7 +18,7 @@ DEVICES = ("auto", "cpu", "cuda")
 class FitOptions:
     """Options of :func:`mass_engine.fit`; the command line has a flag of the same name for each.
 
-    ``template``: see :mod:`mass_engine.template_spec`.
+    ``template``: see :mod:`mass_engine.template_spec`; ``tracks``: :mod:`mass_engine.tracks_spec`.
 
     ``holdout`` N keeps the frames N-1, 2N-1, ... out of the fit (0: none). ``fov`` in degrees spans the
     longer image side; None takes the phone-like default and says so in the report. ``max_frames`` bounds
@@ -25,7 +26,7 @@ class FitOptions:
     """
 
     template: str = "builtin"
-    tracks: Path | None = None
+    tracks: Path | str | None = None
     masks: Path | None = None
     side: str = "auto"
     preset: str = "auto"
@@ -53,6 +54,8 @@ class FitOptions:
                 "device.unavailable", "There are no GPU kernels in this build.", "Use --device cpu or auto."
             )
         parse_template(self.template)
+        if self.tracks is not None:
+            parse_tracks(str(self.tracks))
 
     def is_heldout(self, index: int) -> bool:
         """Whether the frame with this index is kept out of the fit."""

@@ -17,7 +17,7 @@ from mass_engine.export.ply import write_ply
 from mass_engine.fitting.report import FitReport, machine, peak_memory_bytes, versions
 from mass_engine.fitting.trainer import FitResult, fit_hand, schedule_for
 from mass_engine.options import FitOptions
-from mass_engine.preprocess import ASSUMED_FOV, Clip, Warn, prepare
+from mass_engine.preprocess import Clip, Warn, prepare
 from mass_engine.progress import Progress, ProgressMeter
 from mass_engine.tracking.tracks import Tracks, write_tracks
 
@@ -72,7 +72,7 @@ def fit(
             name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()
         },
         side=clip.model.side,
-        fov={"degrees": options.fov or ASSUMED_FOV, "assumed": clip.fov_assumed},
+        fov={"degrees": round(clip.camera.fov_degrees, 2), "assumed": clip.fov_assumed},
         frames={
             "tracked": clip.tracked,
             "fitted": [view.index for view in clip.views if not view.heldout],

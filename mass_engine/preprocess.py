@@ -23,11 +23,13 @@ from mass_engine.options import FitOptions
 from mass_engine.progress import ProgressMeter
 from mass_engine.template_spec import parse_template
 from mass_engine.tracking.alignment import align_landmarks, interpolate_pose
+from mass_engine.tracking.imports.load import load_tracks
 from mass_engine.tracking.landmarks import HandLandmarks
 from mass_engine.tracking.models import HandNetworks
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE, HandMask, HandSegmenter, hand_box
 from mass_engine.tracking.track import track_main_hand
-from mass_engine.tracking.tracks import Tracks, read_tracks
+from mass_engine.tracking.tracks import Tracks
+from mass_engine.tracks_spec import parse_tracks
 from mass_engine.video.reader import Frame, VideoInfo, VideoWarning, probe, read_frames
 
 #: Field of view of the longer image side when the user gives none, degrees: a phone's main camera.
@@ -65,13 +67,25 @@ def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) 
     for code, message in template.notes:
         warn(code, message, "Look at the result with care.")
     info = probe(video)
+    camera = Camera.from_fov(info.width, info.height, options.fov or ASSUMED_FOV)
+    fov_assumed = options.fov is None
     imported = None
     if options.tracks is not None:
-        imported = read_tracks(options.tracks, options.side, (info.width, info.height))
+        loaded = load_tracks(
+            parse_tracks(str(options.tracks)),
+            template,
+            info,
+            options.side,
+            camera,
+            options.fov is not None,
+            options.is_heldout,
+        )
+        for note in loaded.notes:
+            warn(*note)
+        imported = loaded.tracks
+        if fov_assumed and loaded.camera_known:
+            camera, fov_assumed = replace(camera, K=imported.K), False
     marks, times = _landmarks(video, info, options, imported, meter, warn)
-    camera = Camera.from_fov(info.width, info.height, options.fov or ASSUMED_FOV)
-    if imported is not None and options.fov is None:
-        camera = replace(camera, K=imported.K)
     model = template.model(marks[0].side)
     chosen = _choose(marks, options)
     views = _cut_views(video, chosen, times, camera, options, meter)
@@ -83,7 +97,7 @@ def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) 
     return Clip(
         info,
         camera,
-        options.fov is None and imported is None,
+        fov_assumed,
         template.name,
         model,
         views,

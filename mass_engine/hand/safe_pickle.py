@@ -27,6 +27,7 @@ _SPARSE_MODULE = re.compile(r"scipy\.sparse(\.\w+)*")
 _SPARSE_CLASS = re.compile(r"(csc|csr|coo)_(matrix|array)")
 _CHUMPY_MODULE = re.compile(r"chumpy(\.\w+)*")
 _DTYPE = re.compile(r"[<>|=]?([biu][1248]|f[248]|[?bBhHiIlLqQefd])")
+_ANY_DTYPE = re.compile(_DTYPE.pattern + r"|\|?O8?|[<>|=]?[SU]\d{1,5}")
 
 
 class UnsafePickleError(Exception):
@@ -49,9 +50,10 @@ class PickledType(_StandIn):
     """Stand-in for ``numpy.dtype``."""
 
     spec: str = ""
+    known: ClassVar[re.Pattern[str]] = _DTYPE
 
     def __init__(self, spec: object = "", *_: object) -> None:
-        if not isinstance(spec, str) or _DTYPE.fullmatch(spec) is None:
+        if not isinstance(spec, str) or self.known.fullmatch(spec) is None:
             raise UnsafePickleError(f"an array of {str(spec)[:40]!r}, which are not plain numbers")
         self.spec = spec
 
@@ -61,6 +63,12 @@ class PickledType(_StandIn):
         order: Any = self.state[1] if self.state else "="
         plain = np.dtype(self.spec)
         return plain.newbyteorder(order) if order in ("<", ">") else plain
+
+
+class PickledAnyType(PickledType):
+    """The same where arrays may also hold text, or (in a list) objects."""
+
+    known = _ANY_DTYPE
 
 
 class PickledArray(_StandIn):
@@ -101,17 +109,30 @@ def load_arrays(data: bytes) -> dict[str, Any]:
     Raises UnsafePickleError for a name that arrays do not need, ValueError for anything that is not a
     dictionary with names.
     """
+    content = _load(_Unpickler, data)
+    if not isinstance(content, dict):
+        raise ValueError(f"the pickle holds a {type(content).__name__[:40]}, not a dictionary")
+    return {str(name): value for name, value in content.items() if isinstance(name, str | bytes)}
+
+
+def load_values(data: bytes) -> Any:
+    """Whatever a pickle of lists, dictionaries, text, numbers and arrays holds; arrays are still stand-ins.
+
+    Unlike :func:`load_arrays` also ordered and default dictionaries, and arrays of text or of objects (the
+    object array's state then has a list of values instead of bytes). Raises as :func:`load_arrays`.
+    """
+    return _load(_ValueUnpickler, data)
+
+
+def _load(machine: type[_Unpickler], data: bytes) -> Any:
     if len(data) > MOST_BYTES:
         raise ValueError(f"the file is larger than {MOST_BYTES >> 20} MiB")
     try:
-        content = _Unpickler(io.BytesIO(data), encoding="latin1").load()
+        return machine(io.BytesIO(data), encoding="latin1").load()
     except UnsafePickleError:
         raise
     except Exception as error:  # what a broken program of pickle opcodes raises is open-ended
         raise ValueError(f"the pickle cannot be read ({type(error).__name__}: {str(error)[:120]})") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"the pickle holds a {type(content).__name__[:40]}, not a dictionary")
-    return {str(name): value for name, value in content.items() if isinstance(name, str | bytes)}
 
 
 def to_array(value: object) -> NDArray[Any]:
@@ -175,6 +196,8 @@ def _array(kind: object, raw: object, shape: object, order: str) -> NDArray[Any]
     if not isinstance(data, bytes):
         raise ValueError("an array has no bytes")
     dtype = kind.dtype
+    if dtype.hasobject:
+        raise ValueError("an array holds objects, not numbers")
     sizes = tuple(int(size) for size in cast("tuple[int, ...]", shape))
     if any(size < 0 for size in sizes) or math.prod(sizes) * dtype.itemsize != len(data):
         raise ValueError(f"an array of shape {sizes} does not fit its {len(data)} bytes")
@@ -213,6 +236,11 @@ def _new_object(kind: object, *_: object) -> object:
 
 def _nothing(*_: object) -> None:
     """A part of chumpy's bookkeeping that nobody needs."""
+
+
+def _dictionary(*_: object) -> dict[Any, Any]:
+    """An ordered or default dictionary; its items follow."""
+    return {}
 
 
 def _names() -> dict[tuple[str, str], Callable[..., Any]]:
@@ -265,3 +293,15 @@ class _Unpickler(pickle._Unpickler):
     dispatch[pickle.BYTEARRAY8[0]] = _bytes
     for _code in (pickle.EXT1, pickle.EXT2, pickle.EXT4, pickle.PERSID, pickle.BINPERSID, pickle.NEXT_BUFFER):
         dispatch[_code[0]] = _refuse
+
+
+class _ValueUnpickler(_Unpickler):
+    """For :func:`load_values`."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module == "collections" and name in ("OrderedDict", "defaultdict"):
+            return _dictionary
+        if module in ("builtins", "__builtin__") and name in ("dict", "list"):
+            return _nothing  # what a default dictionary fills itself with
+        found = super().find_class(module, name)
+        return PickledAnyType if found is PickledType else found

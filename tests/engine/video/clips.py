@@ -41,7 +41,7 @@ def encoder(
 ) -> Iterator[tuple[av.container.OutputContainer, VideoStream]]:
     """An open container with one video stream in milliseconds; flushed and closed on leaving."""
     flags = {"movflags": options.pop("movflags")} if "movflags" in options else {}
-    with av.open(str(path), "w", options=flags) as container:
+    with av.open(str(path), "w", format=options.pop("format", None), options=flags) as container:
         stream = container.add_stream(codec, rate=25, options=options)
         assert isinstance(stream, VideoStream)
         stream.width, stream.height, stream.pix_fmt = width, height, pix_fmt

@@ -77,6 +77,7 @@ def fit(
             "tracked": clip.tracked,
             "fitted": [view.index for view in clip.views if not view.heldout],
             "heldout": [view.index for view in clip.views if view.heldout],
+            "choice": clip.choice.summary(),
         },
         surfels={
             "kept": len(result.avatar.kept),

@@ -23,6 +23,11 @@ def test_run_directory_holds_what_is_promised(draft_run: Path) -> None:
     assert all(index % 4 == 3 for index in report["frames"]["heldout"])
     assert not set(report["frames"]["heldout"]) & set(report["frames"]["fitted"])
     assert report["scored_frames"] == {"kind": "heldout", "count": len(report["frames"]["heldout"])}
+    assert report["warnings"] == []
+    choice = report["frames"]["choice"]
+    assert choice["chosen"]["index"] == report["frames"]["fitted"]
+    left_out = sum(part["count"] for part in choice["left_out"].values())
+    assert choice["candidates"] == len(report["frames"]["fitted"]) + left_out
     assert report["surfels"]["kept"] > 1000
     assert report["peak_memory_bytes"] > 0
     assert {"track", "segment", "align", "fit"} <= report["seconds"].keys()

@@ -34,7 +34,7 @@ _SHARP = 0.018  # of the sharpest quarter: good clips 0.07 to 0.3, blurred by 1 
 _DIM, _DARK = 40.0, 14.0  # grey value of the palm: good clips 90 to 190, dark skin included
 _NIGHT = 40.0  # grey value that 90 % of a whole picture stays below when no hand is found in it
 _SMALL = 100.0  # pixels, diagonal of the landmarks' box; below 40 the tracker refuses
-_WHOLE_SHARE, _INSIDE = 0.1, 0.7
+_WHOLE_SHARE, _INSIDE = 0.25, 0.7  # good clips 0.97 and 1; half a picture wide enough for the hand 0.15
 _VARIETY = 0.12  # good clips 0.4 to 0.7; a hand that is held still 0.03
 _OTHER_FRAMES, _OTHER_SHARE = 10, 0.05
 

@@ -93,14 +93,14 @@ def test_a_turn_in_the_picture_a_shift_and_a_zoom_are_no_motion() -> None:
 def test_sharpness_falls_with_blur_and_not_with_light_or_size() -> None:
     rng = np.random.default_rng(0)
     noise = rng.normal(0, 1, (400, 400, 3)).astype(np.float32)
-    coarse, fine = (cv2.GaussianBlur(noise, (0, 0), s) * gain for s, gain in ((40, 2000), (3, 60)))
+    coarse, fine = (cv2.GaussianBlur(noise, (0, 0), s) * gain for s, gain in ((40, 5000), (3, 150)))
     image = np.clip(128 + coarse + fine, 0, 255).astype(np.uint8)
     points = open_hand(200, 350, 1.6)
     sharp = measure(image, points)
     soft = measure(np.asarray(cv2.GaussianBlur(image, (0, 0), 8), np.uint8), points)
     assert soft.sharpness < 0.4 * sharp.sharpness
     dim = measure((image * 0.5).astype(np.uint8), points)
-    assert dim.sharpness == pytest.approx(sharp.sharpness, rel=0.1)
+    assert dim.sharpness == pytest.approx(sharp.sharpness, rel=0.2)
     assert dim.light == pytest.approx(sharp.light / 2, rel=0.03)
     twice = np.asarray(cv2.resize(image, (800, 800), interpolation=cv2.INTER_CUBIC), np.uint8)
     assert measure(twice, 2 * points).sharpness == pytest.approx(sharp.sharpness, rel=0.25)

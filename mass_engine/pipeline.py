@@ -77,6 +77,7 @@ def fit(
             "tracked": clip.tracked,
             "fitted": [view.index for view in clip.views if not view.heldout],
             "heldout": [view.index for view in clip.views if view.heldout],
+            "choice": clip.choice.summary(),
         },
         surfels={
             "kept": len(result.avatar.kept),
@@ -145,6 +146,7 @@ def _tracks(name: str, clip: Clip, result: FitResult) -> Tracks:
         torch.stack([torch.from_numpy(view.points) for view in clip.views]).numpy(),
         [view.score for view in clip.views],
         clip.template,
+        any(view.at_joints for view in clip.views),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,18 +16,20 @@ from numpy.typing import NDArray
 from mass_engine.camera import Camera
 from mass_engine.errors import EngineError
 from mass_engine.fitting.views import View
+from mass_engine.frame_choice import FrameChoice, choose_frames
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose, Side
 from mass_engine.hand.template import load_template
 from mass_engine.options import FitOptions
 from mass_engine.progress import ProgressMeter
+from mass_engine.quality import FrameQuality, QualityMeter, check_clip
 from mass_engine.template_spec import parse_template
 from mass_engine.tracking.alignment import align_landmarks, interpolate_pose
 from mass_engine.tracking.imports.load import load_tracks
 from mass_engine.tracking.landmarks import HandLandmarks
 from mass_engine.tracking.models import HandNetworks
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE, HandMask, HandSegmenter, hand_box
-from mass_engine.tracking.track import track_main_hand
+from mass_engine.tracking.track import Track, TrackBuilder
 from mass_engine.tracking.tracks import Tracks
 from mass_engine.tracks_spec import parse_tracks
 from mass_engine.video.reader import Frame, VideoInfo, VideoWarning, probe, read_frames
@@ -46,7 +48,7 @@ Warn = Callable[[str, str, str], None]
 class Clip:
     """``views`` in time order with their ``start`` poses [F]; ``tracked`` counts frames with a hand.
 
-    ``template`` is the name of what ``model`` comes from.
+    ``template`` is the name of what ``model`` comes from; ``choice`` says why these frames are fitted.
     """
 
     info: VideoInfo
@@ -58,10 +60,11 @@ class Clip:
     start: HandPose
     frames_read: int
     tracked: int
+    choice: FrameChoice
 
 
 def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) -> Clip:
-    """Read, track, segment and align. Raises EngineError when the video cannot be used."""
+    """Read, track, judge, segment and align. Raises EngineError when the video cannot be used."""
     meter.update("read", 0.0)
     template = load_template(parse_template(options.template))
     for code, message in template.notes:
@@ -85,9 +88,9 @@ def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) 
         imported = loaded.tracks
         if fov_assumed and loaded.camera_known:
             camera, fov_assumed = replace(camera, K=imported.K), False
-    marks, times = _landmarks(video, info, options, imported, meter, warn)
+    marks, times, quality = _landmarks(video, info, options, imported, meter, warn)
     model = template.model(marks[0].side)
-    chosen = _choose(marks, options)
+    chosen, choice = _choose(marks, quality, times, options)
     views = _cut_views(video, chosen, times, camera, options, meter)
     # Shape parameters mean something else on another template: then only the landmarks are of use.
     if imported is None or imported.template != template.name:
@@ -104,6 +107,7 @@ def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) 
         start,
         len(times),
         len(marks),
+        choice,
     )
 
 
@@ -114,8 +118,10 @@ def _landmarks(
     imported: Tracks | None,
     meter: ProgressMeter,
     warn: Warn,
-) -> tuple[list[HandLandmarks], dict[int, float]]:
-    """Trusted landmarks of the main hand in time order, and the time of every frame read."""
+) -> tuple[list[HandLandmarks], dict[int, float], dict[int, FrameQuality]]:
+    """Trusted landmarks of the main hand in time order, the time of every frame read, and the quality of the
+    frames with landmarks. A clip that cannot give a hand is refused here; the rest of the gate warns."""
+    seen = QualityMeter()
     times: dict[int, float] = {}
 
     def hear(warning: VideoWarning) -> None:
@@ -131,28 +137,48 @@ def _landmarks(
             yield frame
 
     if imported is None:
-        track = track_main_hand(frames(), HandNetworks.load(), options.is_heldout)
+        track = _track(frames(), options, seen)
         side = track.side if options.side == "auto" else cast("Side", options.side)
-        return [replace(mark, side=side) for mark in track.hands.values() if mark.trusted], times
-    for _ in frames():
-        pass
+        marks = [replace(mark, side=side) for mark in track.hands.values() if mark.trusted]
+        return _judged(marks, seen, track.same_side, options, warn), times, seen.of(marks)
     world = imported.joints3d - imported.joints3d.mean(1, keepdims=True)
-    marks = [
-        HandLandmarks(
-            index, imported.pose.side, imported.landmarks2d[row], world[row], imported.scores[row], 0.5
+    given = {
+        index: HandLandmarks(
+            index,
+            imported.pose.side,
+            imported.landmarks2d[row],
+            world[row],
+            imported.scores[row],
+            0.5,
+            at_joints=imported.at_joints,
         )
         for row, index in enumerate(imported.indices)
-        if index in times
-    ]
+    }
+    for frame in frames():
+        seen.add(frame, [given[frame.index]] if frame.index in given else [])
+    marks = [mark for index, mark in given.items() if index in times]
     if len(marks) < 2:
         raise EngineError(
             "tracks.other_video", "The tracks name no frames of this video.", "Give the tracks of this video."
         )
-    return marks, times
+    return _judged(marks, seen, 0, options, warn), times, seen.of(marks)
 
 
-def _choose(marks: Sequence[HandLandmarks], options: FitOptions) -> list[HandLandmarks]:
-    """Every held-out frame, and at most ``max_frames`` others spread evenly over the clip."""
+def _track(frames: Iterator[Frame], options: FitOptions, seen: QualityMeter) -> Track:
+    """Follow the main hand; what ``seen`` measures on the way may explain why there is none."""
+    builder = TrackBuilder(HandNetworks.load())
+    for frame in frames:
+        seen.add(frame, builder.add(frame, options.is_heldout(frame.index)))
+    try:
+        return builder.finish()
+    except EngineError as error:
+        raise seen.explain(error) from error
+
+
+def _judged(
+    marks: list[HandLandmarks], seen: QualityMeter, same_side: int, options: FitOptions, warn: Warn
+) -> list[HandLandmarks]:
+    """``marks``, once their frames to fit have passed the gate. Raises EngineError for what is fatal."""
     train = [mark for mark in marks if not options.is_heldout(mark.index)]
     if len(train) < 2:
         raise EngineError(
@@ -160,11 +186,24 @@ def _choose(marks: Sequence[HandLandmarks], options: FitOptions) -> list[HandLan
             f"Only {len(train)} frames to fit show a hand.",
             "Film one hand, whole, in good light, for a few seconds.",
         )
-    if len(train) > options.max_frames:
-        rows = np.linspace(0, len(train) - 1, options.max_frames).round().astype(int)
-        train = [train[row] for row in np.unique(rows)]
-    keep = {mark.index for mark in train}
-    return [mark for mark in marks if mark.index in keep or options.is_heldout(mark.index)]
+    for finding in check_clip(train, seen.of(train), same_side):
+        if finding.fatal:
+            raise EngineError(finding.code, finding.message, finding.advice)
+        warn(finding.code, finding.message, finding.advice)
+    return marks
+
+
+def _choose(
+    marks: Sequence[HandLandmarks],
+    quality: Mapping[int, FrameQuality],
+    times: Mapping[int, float],
+    options: FitOptions,
+) -> tuple[list[HandLandmarks], FrameChoice]:
+    """Every held-out frame, and at most ``max_frames`` others, the best; in time order."""
+    train = [mark for mark in marks if not options.is_heldout(mark.index)]
+    choice = choose_frames(train, quality, times, options.max_frames)
+    keep = set(choice.frames)
+    return [mark for mark in marks if mark.index in keep or options.is_heldout(mark.index)], choice
 
 
 def _cut_views(

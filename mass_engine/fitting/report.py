@@ -49,7 +49,8 @@ class FitReport:
         total = sum(self.seconds.values())
         lines = [
             f"{self.side} hand, {self.surfels['kept']} surfels, {total:.0f} s, "
-            f"{self.peak_memory_bytes / 2**20:.0f} MiB at most"
+            f"{self.peak_memory_bytes / 2**20:.0f} MiB at most",
+            f"  {len(self.frames['fitted'])} frames fitted of {self.frames['tracked']} that show the hand",
         ]
         kind = self.scored_frames.get("kind", "")
         for name, value in self.metrics.items():

@@ -23,6 +23,7 @@ _MIN_FRAMES, _MIN_SHARE, _ENOUGH_FRAMES = 5, 0.1, 30
 _MIN_SCALE = 40.0  # pixels, diagonal of the landmarks' box
 _JUMP = 0.2  # distance from where the neighbours put the hand, in hand sizes
 _BONE_CHANGE = 0.8  # mean absolute log ratio of the bones' lengths to the clip's
+_SURE_SIDE = 0.3  # how far from 1/2 the mean probability of a side must be
 _NEAR = 6  # frames: neighbours further away say nothing about a jump
 
 
@@ -33,7 +34,7 @@ class Track:
     ``hands`` by frame index, in order, all with the voted ``side``; ``side_confidence`` 0.5..1 is the
     share of the vote that went to it; ``times`` in seconds of all frames read; ``heldout`` frame indices;
     ``width``, ``height`` of the frames in pixels; ``other_hands`` the most frames in which any one other
-    hand was followed.
+    hand was followed; ``same_side`` those in which another hand, surely of the same side, was seen beside it.
     """
 
     side: Side
@@ -44,6 +45,7 @@ class Track:
     width: int
     height: int
     other_hands: int
+    same_side: int = 0
 
     @property
     def missed(self) -> list[int]:
@@ -131,8 +133,9 @@ def main_hand(
         if picked is not None:
             marked[index] = replace(picked, side=side, trusted=_jump(picked, trusted) <= _JUMP)
     others = max((len(run) for track, run in runs.items() if track not in chosen), default=0)
+    same = _same_side([run for track, run in runs.items() if track not in chosen], hands)
     ordered = dict(sorted(marked.items()))
-    return Track(side, max(right, 1 - right), ordered, tuple(times), held, width, height, others)
+    return Track(side, max(right, 1 - right), ordered, tuple(times), held, width, height, others, same)
 
 
 def _choose(runs: Mapping[int, Mapping[int, HandLandmarks]]) -> list[int]:
@@ -148,12 +151,25 @@ def _choose(runs: Mapping[int, Mapping[int, HandLandmarks]]) -> list[int]:
         side = float(np.mean([hand.right for hand in runs[track].values()])) - 0.5
         if not chosen:
             main_side = side
-        opposite = len(runs[track]) >= 10 and side * main_side < 0 and min(abs(side), abs(main_side)) > 0.3
+        opposite = (
+            len(runs[track]) >= 10 and side * main_side < 0 and min(abs(side), abs(main_side)) > _SURE_SIDE
+        )
         if opposite or taken & runs[track].keys():
             continue
         chosen.append(track)
         taken |= runs[track].keys()
     return chosen
+
+
+def _same_side(others: Sequence[Mapping[int, HandLandmarks]], main: Mapping[int, HandLandmarks]) -> int:
+    """Frames in which one of ``others`` is beside ``main`` and surely of the same side: not one person's."""
+    side = float(np.mean([hand.right for hand in main.values()])) - 0.5
+    frames: set[int] = set()
+    for run in others:
+        other = float(np.mean([hand.right for hand in run.values()])) - 0.5
+        if side * other > 0 and min(abs(side), abs(other)) > _SURE_SIDE:
+            frames |= run.keys() & main.keys()
+    return len(frames)
 
 
 def _require_hand(hands: Mapping[int, HandLandmarks], frames: int) -> None:

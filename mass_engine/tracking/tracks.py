@@ -26,7 +26,8 @@ class Tracks:
     """One hand in F frames: ``indices``, ``times`` [F], ``pose`` batched, ``joints3d`` [F,21,3] camera
     metres, ``landmarks2d`` [F,21,2] pixels, ``scores`` [F]; ``K`` [3,3] for pictures of ``size`` (w, h).
 
-    ``template`` names the hand that the poses, and above all ``betas``, are of.
+    ``template`` names the hand that the poses, and above all ``betas``, are of. ``at_joints``: ``landmarks2d``
+    are projected joints of a hand model, not what a tracker saw in the picture.
     """
 
     video: str
@@ -40,6 +41,7 @@ class Tracks:
     landmarks2d: NDArray[np.float32]
     scores: list[float]
     template: str = "builtin"
+    at_joints: bool = False
 
 
 def write_tracks(tracks: Tracks, path: Path) -> None:
@@ -64,6 +66,7 @@ def write_tracks(tracks: Tracks, path: Path) -> None:
         "height": tracks.size[1],
         "K": _rounded(tracks.K, 4),
         "template": tracks.template,
+        "landmarks_at_joints": tracks.at_joints,
         "frames": frames,
     }
     partial = path.with_name(path.name + ".partial")
@@ -126,6 +129,7 @@ def _parse(data: dict[str, Any], side: str, size: tuple[int, int]) -> Tracks:
         column("landmarks2d", (21, 2)).numpy(),
         [min(1.0, max(0.0, float(hand["score"]))) for _, hand in rows],
         str(data.get("template", "builtin")),
+        bool(data.get("landmarks_at_joints", False)),
     )
 
 

@@ -15,6 +15,7 @@ import av.container
 
 from mass_engine.errors import EngineError
 from mass_engine.video.limits import VideoLimits
+from mass_engine.video.mp4_index import check_index
 
 #: ISO base media and QuickTime files begin with one of these boxes (offset 4).
 _MOV_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
@@ -45,7 +46,8 @@ def open_container(path: str | os.PathLike[str], limits: VideoLimits) -> av.cont
     """Open ``path`` with the demuxer its first bytes name.
 
     Raises EngineError ``video.not_found``, ``video.empty``, ``video.too_large``,
-    ``video.unsupported_container``, ``video.too_many_pixels`` or ``video.corrupt``.
+    ``video.unsupported_container``, ``video.too_long``, ``video.too_many_edits``,
+    ``video.too_many_pixels`` or ``video.corrupt``.
     """
     file = Path(path)
     try:
@@ -70,6 +72,9 @@ def open_container(path: str | os.PathLike[str], limits: VideoLimits) -> av.cont
         raise EngineError(
             "video.unsupported_container", "The file is not an mp4, mov, webm or mkv video.", _RECORD_AGAIN
         )
+    if demuxer == "mov":
+        with file.open("rb") as stream:
+            check_index(stream, size, limits)
     # Coded sizes are padded to whole blocks, hence the slack; the exact cap is applied to decoded frames.
     options = {"max_pixels": str(limits.max_pixels + limits.max_pixels // 8), "protocol_whitelist": "file"}
     try:

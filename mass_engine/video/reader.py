@@ -22,6 +22,8 @@ from mass_engine.video.orientation import Orientation
 
 #: Fewer decoded frames than this share of the declared number count as a truncated file.
 _COMPLETE = 0.9
+_DOLBY_TAGS = ("dvh1", "dvhe", "dva1", "dvav", "dav1")
+_UNSPECIFIED = 2  # transfer characteristics: the file does not say
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ def probe(path: str | os.PathLike[str], limits: VideoLimits | None = None) -> Vi
         first = next(_decode(container, stream, limits, _Losses()), None)
         if first is None:
             raise corrupt("no picture could be decoded")
+        _refuse_proprietary_colors(first, stream)
         orientation = Orientation.of(first)
         height, width = orientation.size(*_square_size(first, stream))
         codec = stream.codec_context.name
@@ -86,7 +89,8 @@ def read_frames(
 
     A damaged or cut file yields what decodes; ``on_warning`` hears of it at the end. Raises EngineError
     with a code ``video.*``: ``not_found``, ``empty``, ``too_large``, ``unsupported_container``, ``corrupt``,
-    ``no_video_track``, ``too_many_pixels``, ``too_long``, ``size_changes``, ``too_short`` (a single frame).
+    ``no_video_track``, ``too_many_pixels``, ``too_long``, ``too_many_edits``, ``size_changes``,
+    ``dolby_vision``, ``too_short`` (a single frame).
     """
     limits = limits or VideoLimits()
     with open_container(path, limits) as container:
@@ -105,6 +109,8 @@ def read_frames(
             time = stamp - start if index == 0 or stamp - start > time else time + step
             if index >= limits.max_frames or time > limits.max_seconds:
                 raise _too_long(limits)
+            if index == 0:
+                _refuse_proprietary_colors(picture, stream)
             rgb = _upright(picture, stream)
             if shape is not None and rgb.shape != shape:
                 raise EngineError(
@@ -175,6 +181,21 @@ def _decode(
             yield picture
 
 
+def _refuse_proprietary_colors(picture: av.VideoFrame, stream: VideoStream) -> None:
+    """Refuse Dolby Vision without a compatible base layer (profile 5): its colours are no known colour space.
+
+    Its tracks carry a name of their own and leave the transfer function open; phones write profile 8.4,
+    whose base layer is plain HLG and is tone-mapped like it.
+    """
+    tag = str(stream.codec_context.codec_tag).lower()
+    if tag in _DOLBY_TAGS and int(picture.color_trc or _UNSPECIFIED) == _UNSPECIFIED:
+        raise EngineError(
+            "video.dolby_vision",
+            "The video is Dolby Vision without a standard base layer.",
+            "Export it as HDR (HLG) or SDR, or switch HDR video off in the camera's settings.",
+        )
+
+
 def _upright(picture: av.VideoFrame, stream: VideoStream) -> NDArray[np.uint8]:
     rgb = to_rgb(picture)
     height, width = _square_size(picture, stream)
@@ -230,10 +251,10 @@ def _report_losses(
     losses: _Losses,
     on_warning: Callable[[VideoWarning], None],
 ) -> None:
-    if declared is not None:
-        complete = decoded >= _COMPLETE * declared
-    else:
-        complete = declared_seconds is None or seconds >= _COMPLETE * declared_seconds
+    # An edit list may leave out many of the declared frames, and a last frame may stand for long.
+    complete = declared is None and declared_seconds is None
+    complete |= declared is not None and decoded >= _COMPLETE * declared
+    complete |= declared_seconds is not None and seconds >= _COMPLETE * declared_seconds
     if not complete or losses.ended:
         of = f" of {declared} declared" if declared else ""
         on_warning(VideoWarning("video.truncated", f"The file ends early: {decoded} frames{of} were read."))

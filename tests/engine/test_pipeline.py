@@ -14,6 +14,7 @@ import trimesh
 from mass_engine import Avatar, BadArgumentError, EngineError
 from mass_engine.export.ply import read_ply, write_ply
 from mass_engine.rendering import render_frames, render_to_file
+from tests.engine.video.odd import PERSONAL
 
 
 def test_run_directory_holds_what_is_promised(draft_run: Path) -> None:
@@ -22,6 +23,11 @@ def test_run_directory_holds_what_is_promised(draft_run: Path) -> None:
     assert all(index % 4 == 3 for index in report["frames"]["heldout"])
     assert not set(report["frames"]["heldout"]) & set(report["frames"]["fitted"])
     assert report["scored_frames"] == {"kind": "heldout", "count": len(report["frames"]["heldout"])}
+    assert report["warnings"] == []
+    choice = report["frames"]["choice"]
+    assert choice["chosen"]["index"] == report["frames"]["fitted"]
+    left_out = sum(part["count"] for part in choice["left_out"].values())
+    assert choice["candidates"] == len(report["frames"]["fitted"]) + left_out
     assert report["surfels"]["kept"] > 1000
     assert report["peak_memory_bytes"] > 0
     assert {"track", "segment", "align", "fit"} <= report["seconds"].keys()
@@ -35,6 +41,17 @@ def test_run_directory_holds_what_is_promised(draft_run: Path) -> None:
     )
     assert len(tracks["frames"][0]["hands"][0]["hand_pose"]) == 45
     assert len(list((draft_run / "previews").iterdir())) >= 10
+
+
+def test_personal_tags_reach_no_output(demo_clip: Path, draft_run: Path) -> None:
+    secrets = [value.encode() for value in PERSONAL.values()]
+    assert all(secret in demo_clip.read_bytes() for secret in secrets)
+    files = [path for path in draft_run.rglob("*") if path.is_file()]
+    assert len(files) > 10
+    for path in files:
+        content = path.read_bytes()
+        assert not [secret for secret in secrets if secret in content], path.name
+        assert b"Exif" not in content
 
 
 def test_the_hand_of_a_known_clip_is_found_again(draft_run: Path) -> None:

@@ -80,7 +80,7 @@ def load_tracks(
         K = track.K if camera_known else assumed.K.double().numpy()
         tracks, placed = _place(track, template, mano, K, size, is_heldout)
         times = [index / max(info.fps, 1e-6) for index in tracks.indices]
-        tracks = replace(tracks, fps=info.fps, times=times)
+        tracks = replace(tracks, fps=info.fps, times=times, at_joints=True)
         return LoadedTracks(tracks, camera_known, (*track.notes, *notes, *placed))
 
     if kind == "arctic":

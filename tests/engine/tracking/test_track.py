@@ -67,6 +67,15 @@ def test_the_other_hand_alone_is_not_taken_for_the_main_one() -> None:
     assert max(choose(found, 32).hands) == 19
 
 
+@pytest.mark.parametrize(("right", "frames"), [(0.95, 15), (0.05, 0), (0.6, 0)])
+def test_a_second_hand_of_the_same_side_is_counted(right: float, frames: int) -> None:
+    """Another person's; the same person's other hand and an unsure reading are not."""
+    found = together(
+        moving_hand(range(30), track=0), moving_hand(range(5, 20), track=1, right=right, x=350, scale=0.6)
+    )
+    assert choose(found, 30).same_side == frames
+
+
 def test_a_jump_is_not_trusted_and_its_neighbours_are() -> None:
     found = moving_hand(range(20))
     found[9] = [replace(found[9][0], points=found[9][0].points + np.float32(90))]

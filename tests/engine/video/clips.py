@@ -43,7 +43,7 @@ def encoder(
     if codec == "libx265":  # its reordered frames reach the muxer without a decoding time now and then
         options.setdefault("x265-params", "bframes=0:log-level=error")
     flags = {"movflags": options.pop("movflags")} if "movflags" in options else {}
-    with av.open(str(path), "w", options=flags) as container:
+    with av.open(str(path), "w", format=options.pop("format", None), options=flags) as container:
         stream = container.add_stream(codec, rate=25, options=options)
         assert isinstance(stream, VideoStream)
         stream.width, stream.height, stream.pix_fmt = width, height, pix_fmt

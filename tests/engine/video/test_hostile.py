@@ -1,10 +1,9 @@
-"""What a bad video gives: its own stable code, one sentence of advice, nothing else."""
+"""What a bad video gives: its own stable code, one sentence of advice, nothing else. More in test_corpus."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from mass_engine.errors import EngineError
 from mass_engine.video.container import sniff
 from mass_engine.video.limits import VideoLimits
 from mass_engine.video.reader import probe, read_frames
-from tests.engine.video.clips import make_audio, make_clip, moving, picture, quadrants
+from tests.engine.video.clips import make_clip, moving, picture, quadrants
 
 
 def code_of(path: Path, limits: VideoLimits | None = None) -> str:
@@ -28,91 +27,11 @@ def code_of(path: Path, limits: VideoLimits | None = None) -> str:
     return caught.value.code
 
 
-def _text(path: Path) -> None:
-    path.write_text("not a video\n" * 100)
-
-
-def _empty(path: Path) -> None:
-    path.touch()
-
-
-def _short(path: Path) -> None:
-    path.write_bytes(b"\0\0")
-
-
-def _avi(path: Path) -> None:
-    path.write_bytes(b"RIFF\x00\x10\x00\x00AVI LIST" + bytes(500))
-
-
-def _only_magic(path: Path) -> None:
-    path.write_bytes(b"\0\0\0\x18ftypisom" + bytes(12))
-
-
-def _only_ebml(path: Path) -> None:
-    path.write_bytes(b"\x1a\x45\xdf\xa3" + bytes(200))
-
-
-def _magic_and_noise(path: Path) -> None:
-    noise = np.random.default_rng(1).integers(0, 256, 20_000, dtype=np.uint8).tobytes()
-    path.write_bytes(b"\0\0\0\x18ftypisom" + noise)
-
-
-def _without_index(path: Path) -> None:
-    whole = make_clip(path.with_name("whole.mp4"), moving(30)).read_bytes()  # its index is at the end
-    path.write_bytes(whole[: len(whole) // 2])
-
-
-def _single(path: Path) -> None:
-    make_clip(path, [quadrants()])
-
-
-def _audio(path: Path) -> None:
-    make_audio(path)
-
-
-def _playlist(path: Path) -> None:
-    make_clip(path.with_name("secret.mp4"), [quadrants()] * 3)
-    path.write_text("ffconcat version 1.0\nfile secret.mp4\n")
-
-
-def _hls(path: Path) -> None:
-    make_clip(path.with_name("secret.mp4"), [quadrants()] * 3)
-    path.write_text("#EXTM3U\n#EXT-X-TARGETDURATION:3\n#EXTINF:3,\nsecret.mp4\n#EXT-X-ENDLIST\n")
-
-
-@pytest.mark.parametrize(
-    ("make", "code"),
-    [
-        (_text, "video.unsupported_container"),
-        (_empty, "video.empty"),
-        (_short, "video.unsupported_container"),
-        (_avi, "video.unsupported_container"),
-        (_only_magic, "video.corrupt"),
-        (_only_ebml, "video.corrupt"),
-        (_magic_and_noise, "video.corrupt"),
-        (_without_index, "video.corrupt"),
-        (_single, "video.too_short"),
-        (_audio, "video.no_video_track"),
-        (_playlist, "video.unsupported_container"),
-        (_hls, "video.unsupported_container"),
-    ],
-)
-def test_each_bad_file_has_its_code(tmp_path: Path, make: Callable[[Path], None], code: str) -> None:
-    path = tmp_path / "clip.mp4"
-    make(path)
-    assert code_of(path) == code
-
-
-def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
+def test_a_missing_file_a_folder_and_a_device(tmp_path: Path) -> None:
+    (tmp_path / "device.mp4").symlink_to("/dev/zero")
+    assert code_of(tmp_path / "device.mp4") == "video.not_found"
     assert code_of(tmp_path / "nothing.mp4") == "video.not_found"
     assert code_of(tmp_path) == "video.not_found"
-
-
-def test_a_playlist_behind_a_magic_number_opens_no_other_file(tmp_path: Path) -> None:
-    make_clip(tmp_path / "secret.mp4", [quadrants()] * 3)
-    path = tmp_path / "clip.mp4"
-    path.write_bytes(b"\0\0\0\x18ftypisom\nffconcat version 1.0\nfile secret.mp4\n")
-    assert code_of(path) == "video.corrupt"
 
 
 def test_a_file_named_like_a_protocol_is_only_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,8 +26,8 @@ class Tracks:
     """One hand in F frames: ``indices``, ``times`` [F], ``pose`` batched, ``joints3d`` [F,21,3] camera
     metres, ``landmarks2d`` [F,21,2] pixels, ``scores`` [F]; ``K`` [3,3] for pictures of ``size`` (w, h).
 
-    ``template`` names the hand that the poses, and above all ``betas``, are of. ``at_joints``: ``landmarks2d``
-    are projected joints of a hand model, not what a tracker saw in the picture.
+    ``template`` names the hand that the poses, and above all ``betas``, are of. ``at_joints``: the
+    ``landmarks2d`` are joints of a hand model, not what a tracker saw in the picture.
     """
 
     video: str

@@ -11,6 +11,7 @@ from mass_engine.hand.builtin import load_builtin
 from mass_engine.hand.pose import HandPose, Side
 from mass_engine.tracking.alignment import align_landmarks, interpolate_pose
 from mass_engine.tracking.landmarks import HandLandmarks
+from mass_engine.tracking.offsets import tracked_points
 
 CAMERA = Camera.from_fov(640, 480, 60.0)
 
@@ -27,17 +28,21 @@ def moving_hand(side: Side, count: int) -> HandPose:
     return HandPose(betas, turn, fingers.flatten(1), transl, side)
 
 
-def observed(truth: HandPose, noise: float) -> tuple[list[HandLandmarks], torch.Tensor]:
-    joints = load_builtin(truth.side).joints(truth)
+def observed(
+    truth: HandPose, noise: float, at_joints: bool = False
+) -> tuple[list[HandLandmarks], torch.Tensor]:
+    joints, turns = load_builtin(truth.side).skeleton(truth)
+    points = tracked_points(joints, turns, truth.side, torch.full((len(joints),), at_joints))
     random = np.random.default_rng(0)
-    pixels = CAMERA.project(joints).numpy()
-    world = (joints - joints.mean(1, keepdim=True)).numpy()
+    pixels = CAMERA.project(points).numpy()
+    world = (points - points.mean(1, keepdim=True)).numpy()
     size = np.ptp(pixels, axis=1).max()
     marks = []
     for row in range(len(joints)):
         seen = (pixels[row] + random.normal(0, noise * size, (21, 2))).astype(np.float32)
         cue = (world[row] * random.uniform(0.9, 1.1) + random.normal(0, 0.003, (21, 3))).astype(np.float32)
-        marks.append(HandLandmarks(row, truth.side, seen, cue, 1.0, 1.0 if truth.side == "right" else 0.0))
+        right = 1.0 if truth.side == "right" else 0.0
+        marks.append(HandLandmarks(row, truth.side, seen, cue, 1.0, right, at_joints=at_joints))
     return marks, joints
 
 
@@ -52,10 +57,11 @@ def similarity_error(found: torch.Tensor, truth: torch.Tensor) -> float:
     return float((scale[:, None, None] * a @ rotation - b).norm(dim=-1).mean())
 
 
+@pytest.mark.parametrize("at_joints", [False, True])
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_a_known_hand_is_recovered_from_noisy_points(side: Side) -> None:
+def test_a_known_hand_is_recovered_from_noisy_points(side: Side, at_joints: bool) -> None:
     truth = moving_hand(side, 24)
-    marks, joints = observed(truth, 0.01)
+    marks, joints = observed(truth, 0.01, at_joints)
     found = align_landmarks(load_builtin(side), marks, [i / 30 for i in range(24)], CAMERA)
     assert found.pose.side == side
     assert float(found.error.mean()) < 0.02
@@ -85,3 +91,19 @@ def test_interpolation_meets_its_ends_and_takes_the_short_way() -> None:
     torch.testing.assert_close(got[0], want[1], atol=1e-4, rtol=0)
     torch.testing.assert_close(got[2], want[2], atol=1e-4, rtol=0)
     assert float((got[1] - (want[1] + want[2]) / 2).norm(dim=-1).max()) < 0.005
+
+
+def test_points_lie_off_the_joints_the_same_way_on_either_hand() -> None:
+    flip = torch.tensor([-1.0, 1.0, 1.0])
+    apart = []
+    for side in ("right", "left"):
+        rest = HandPose.rest(side)  # type: ignore[arg-type]
+        joints, turns = load_builtin(side).skeleton(rest)  # type: ignore[arg-type]
+        seen = tracked_points(joints[None], turns[None], side, torch.tensor([False]))  # type: ignore[arg-type]
+        apart.append(seen[0] - joints)
+        assert torch.equal(
+            tracked_points(joints[None], turns[None], side, torch.tensor([True]))[0],  # type: ignore[arg-type]
+            joints,
+        )
+    torch.testing.assert_close(apart[0] * flip, apart[1])
+    assert 1e-3 < float(apart[0].norm(dim=-1).mean()) < 1e-2

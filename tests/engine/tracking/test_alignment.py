@@ -97,12 +97,12 @@ def test_points_lie_off_the_joints_the_same_way_on_either_hand() -> None:
     flip = torch.tensor([-1.0, 1.0, 1.0])
     apart = []
     for side in ("right", "left"):
-        rest = HandPose.rest(side)  # type: ignore[arg-type]
-        joints, turns = load_builtin(side).skeleton(rest)  # type: ignore[arg-type]
-        seen = tracked_points(joints[None], turns[None], side, torch.tensor([False]))  # type: ignore[arg-type]
+        rest = HandPose.rest(side)
+        joints, turns = load_builtin(side).skeleton(rest)
+        seen = tracked_points(joints[None], turns[None], side, torch.tensor([False]))
         apart.append(seen[0] - joints)
         assert torch.equal(
-            tracked_points(joints[None], turns[None], side, torch.tensor([True]))[0],  # type: ignore[arg-type]
+            tracked_points(joints[None], turns[None], side, torch.tensor([True]))[0],
             joints,
         )
     torch.testing.assert_close(apart[0] * flip, apart[1])

@@ -1,6 +1,7 @@
 """Which frames to fit: sharp, well lit, surely tracked ones that differ from one another.
 
-Farthest-point sampling (Gonzalez 1985) over pose and time, each step weighted by how good a frame is.
+Farthest-point sampling (Gonzalez 1985) over pose, place and time: each step takes the frame with the largest
+product of its worth and its squared distance from those taken, so that fast, blurred poses are not lost.
 Held-out frames have no say, and equal clips give equal choices.
 """
 
@@ -21,15 +22,16 @@ _FAST = 4.0  # hand sizes a second at which motion blur halves a frame's worth
 _BLURRED = 0.15  # of the clip's sharp frames (its 75th percentile)
 _CROPPED = 0.6  # share of landmarks in the picture
 _BURNT = 0.5  # share of the hand's box that is black or burnt out, above the clip's median
-_ALIKE, _SOON = 0.015, 0.1  # a pose within the tracker's noise, and not a tenth of a second later
+_ALIKE, _STILL = 0.015, 0.02  # within the tracker's noise: shape, and place in hand sizes
+_SOON = 0.1  # seconds: two frames alike and so close in time are one
 _FEW = 8  # bad frames are left out only while this many stay
 
 
 @dataclass(frozen=True)
 class FrameChoice:
     """``frames`` to fit, in order, with the ``reason`` for each (``best``: the first one taken; ``pose``,
-    ``time``: what it adds most of), its ``quality`` 0..1 and ``sharpness``; ``left_out`` frames by reason:
-    ``blurred``, ``cropped``, ``badly_exposed``, ``alike``, ``over_limit``."""
+    ``place``, ``time``: what it adds most of), its ``quality`` 0..1 and ``sharpness``; ``left_out`` frames by
+    reason: ``blurred``, ``cropped``, ``badly_exposed``, ``alike``, ``over_limit``."""
 
     frames: list[int]
     reason: list[str]
@@ -71,7 +73,7 @@ def choose_frames(
     usable = np.array([reason == "" for reason in bad])
     if int(usable.sum()) < min(_FEW, len(hands)):
         usable[:] = True
-    picked, reasons, alike = _spread(pose_shapes(hands), clock, np.where(usable, worth, 0.0), limit)
+    picked, reasons, alike = _spread(hands, clock, np.where(usable, worth, 0.0), limit)
     why = dict(zip(picked, reasons, strict=True))
     left: dict[str, list[int]] = {
         name: [] for name in ("blurred", "cropped", "badly_exposed", "alike", "over_limit")
@@ -136,38 +138,45 @@ def _bad(measures: Sequence[FrameQuality], sharp: NDArray[np.float64]) -> list[s
 
 
 def _spread(
-    shapes: NDArray[np.complex128], clock: NDArray[np.float64], worth: NDArray[np.float64], limit: int
+    hands: Sequence[HandLandmarks], clock: NDArray[np.float64], worth: NDArray[np.float64], limit: int
 ) -> tuple[list[int], list[str], set[int]]:
     """Rows taken one by one, why each, and the rows too much like one of them to be taken.
 
-    Distances are in units of what a step of an even choice would make, in pose and in time, so that both
-    count alike however long the clip is and however lively the hand.
+    Each part of a distance is in units of what a step of an even choice would make, so that pose, place and
+    time count alike however long the clip is and however lively the hand.
     """
     count = len(clock)
-    time_unit = max(float(clock[-1] - clock[0]) / min(limit, count), 1e-6)
+    shapes = pose_shapes(hands)
+    places = np.stack([hand.points for hand in hands]).astype(np.float64).reshape(count, -1)
+    places /= np.sqrt(21) * float(np.median([max(hand.scale, 1e-6) for hand in hands]))
+
+    def parts(row: int) -> NDArray[np.float64]:
+        """Distances [3,count] from ``row``: of shape, of landmarks in hand sizes, of time in seconds."""
+        moved = np.linalg.norm(places - places[row], axis=1)
+        return np.stack([pose_distances(shapes, shapes[row]), moved, np.abs(clock - clock[row])])
+
     even = np.unique(np.linspace(0, count - 1, min(limit, count) + 1).round().astype(int))
-    steps = [float(pose_distances(shapes[a : a + 1], shapes[b])[0]) for a, b in pairwise(even)]
-    pose_unit = max(float(np.mean(steps)) if steps else 0.0, _ALIKE)
+    steps = np.array([parts(a)[:, b] for a, b in pairwise(even)])
+    units = np.maximum(steps.mean(0), (_ALIKE, _STILL, 1e-6))[:, None]
     far = np.full(count, np.inf)
-    pose_part, alike = np.zeros(count), np.zeros(count, bool)
+    most, alike = np.zeros(count, np.int64), np.zeros(count, bool)
     picked: list[int] = []
     reasons: list[str] = []
     row = int(np.argmax(worth))
     while True:
         picked.append(row)
-        reasons.append("best" if len(picked) == 1 else "pose" if pose_part[row] >= 0.5 else "time")
-        apart = pose_distances(shapes, shapes[row])
-        late = np.abs(clock - clock[row])
-        pose2, time2 = (apart / pose_unit) ** 2, (late / time_unit) ** 2
-        nearer = pose2 + time2 < far
-        far = np.where(nearer, pose2 + time2, far)
-        pose_part = np.where(nearer, pose2 / np.maximum(pose2 + time2, 1e-12), pose_part)
-        alike |= (apart < _ALIKE) & (late < _SOON)
+        reasons.append("best" if len(picked) == 1 else ("pose", "place", "time")[most[row]])
+        apart = parts(row)
+        squares = (apart / units) ** 2
+        nearer = squares.sum(0) < far
+        far = np.where(nearer, squares.sum(0), far)
+        most = np.where(nearer, squares.argmax(0), most)
+        alike |= (apart < np.array([[_ALIKE], [_STILL], [_SOON]])).all(0)
         alike[picked] = True
-        gain = np.where(alike, 0.0, worth * np.sqrt(far))
+        gain = np.where(alike, 0.0, worth * far)
         if len(picked) < limit and gain.max() > 0.0:
             row = int(np.argmax(gain))
         elif len(picked) == 1 and count > 1:
-            row = int(np.argmax(late))  # nothing differs, but a fit needs two frames
+            row = int(np.argmax(apart[2]))  # nothing differs, but a fit needs two frames
         else:
             return picked, reasons, set(np.flatnonzero(alike).tolist()) - set(picked)

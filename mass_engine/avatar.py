@@ -25,7 +25,6 @@ from mass_engine.fitting.subject import (
     pose_surfels,
     render_row,
     surfel_colors,
-    vertex_normals,
 )
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose, Side
@@ -37,7 +36,7 @@ from mass_engine.surfel.harmonics import rgb_to_sh0
 from mass_engine.viewpoint import parse_camera
 
 FILE_NAME = "avatar.safetensors"
-_FORMAT = "1"
+_FORMAT = "2"
 
 
 @dataclass(frozen=True)
@@ -143,7 +142,7 @@ class Avatar:
     def _bounds(self, pose: HandPose) -> tuple[Tensor, float]:
         """Centre [3] and radius of a sphere around the posed hand."""
         with torch.no_grad():
-            vertices = self.shape.model.posed(pose, self.shape.offsets()).vertices[0]
+            vertices = self.shape.model.posed(pose, self.shape.displacement).vertices[0]
         center = (vertices.amax(0) + vertices.amin(0)) / 2
         return center, float((vertices - center).norm(dim=-1).max())
 
@@ -279,7 +278,6 @@ def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Avatar:
         model,
         tensors["shape.betas"],
         tensors["shape.displacement"],
-        vertex_normals(model.template, model.faces),
     )
     width, height = json.loads(metadata["size"])
     pose = HandPose(

@@ -256,15 +256,27 @@ def _view(
     camera: Camera,
 ) -> View:
     height, width = rgb.shape[:2]
-    labels = mask.full(height, width)
+    labels, coverage = mask.full(height, width), mask.full_coverage(height, width)
     view_camera = camera.crop(*box)
     scale = CROP_LIMIT / max(height, width)
     if scale < 1:
         size = max(1, round(width * scale)), max(1, round(height * scale))
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
         labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        coverage = np.asarray(cv2.resize(coverage, size, interpolation=cv2.INTER_AREA), np.float32)
         view_camera = view_camera.resized(*size)
-    return View(mark.index, time, heldout, rgb, labels, view_camera, mark.points, mark.score, mark.at_joints)
+    return View(
+        mark.index,
+        time,
+        heldout,
+        rgb,
+        labels,
+        view_camera,
+        mark.points,
+        mark.score,
+        mark.at_joints,
+        coverage,
+    )
 
 
 def _user_mask(directory: Path, index: int, box: tuple[int, int, int, int], camera: Camera) -> HandMask:
@@ -288,7 +300,7 @@ def _user_mask(directory: Path, index: int, box: tuple[int, int, int, int], came
     labels = np.full(part.shape, IGNORE, np.uint8)
     labels[part == 0] = BACKGROUND
     labels[part == 255] = HAND
-    return HandMask((0, 0, w, h), labels)
+    return HandMask((0, 0, w, h), labels, (labels == HAND).astype(np.float32))
 
 
 def _align(

@@ -51,13 +51,13 @@ def _matte(
     sure: float,
     reach: float,
 ) -> NDArray[np.float32]:
-    size = 2 * round(reach) + 1
     color = rgb.astype(np.float32)
-    fore = _local_mean(color, (edge > sure) & (edge < 2.5 * reach) & ~ignore, size)
-    back = _local_mean(color, (edge < -sure) & (edge > -2.5 * reach) & ~ignore, size)
+    known_hand = (edge > sure) & (edge < 2.5 * reach) & ~ignore
+    known_rest = (edge < -sure) & (edge > -2.5 * reach) & ~ignore
+    fore, back = (_local_mean(color, side, reach) for side in (known_hand, known_rest))
     line = fore[..., :3] - back[..., :3]
-    contrast = (line * line).sum(-1)
-    place = ((color - back[..., :3]) * line).sum(-1) / np.maximum(contrast, 1.0)
+    contrast = np.einsum("hwc,hwc->hw", line, line)
+    place = np.einsum("hwc,hwc->hw", color - back[..., :3], line) / np.maximum(contrast, 1.0)
     place = 0.5 + _GAIN * (place - 0.5)
     known = np.minimum(fore[..., 3], back[..., 3]) > 0.01
     trust = np.where(known, contrast / (contrast + _CONTRAST**2), 0.0).astype(np.float32)
@@ -69,10 +69,17 @@ def _matte(
     return np.where(np.abs(far) <= _BAND, alpha, far > 0).astype(np.float32)
 
 
-def _local_mean(color: NDArray[np.float32], use: NDArray[np.bool_], size: int) -> NDArray[np.float32]:
-    """Mean colour of the used pixels in a window of ``size``, and their share of it: [h,w,4]."""
+def _local_mean(color: NDArray[np.float32], use: NDArray[np.bool_], reach: float) -> NDArray[np.float32]:
+    """Mean colour of the used pixels up to ``reach`` away, and their share: [h,w,4].
+
+    Sums are taken at half the size: a mean over so many pixels loses nothing by it.
+    """
+    height, width = use.shape
+    half = max(1, width // 2), max(1, height // 2)
     weight = use.astype(np.float32)
-    stack = np.dstack([color * weight[..., None], weight])
-    summed = np.asarray(cv2.blur(stack, (size, size), borderType=cv2.BORDER_CONSTANT), np.float32)
-    summed[..., :3] /= np.maximum(summed[..., 3:], 1e-6)
-    return summed
+    stack = cv2.merge([*cv2.split(color * weight[..., None]), weight])
+    halved = cv2.resize(stack, half, interpolation=cv2.INTER_AREA)
+    size = 2 * max(1, round(reach / 2)) + 1
+    small = np.asarray(cv2.blur(halved, (size, size), borderType=cv2.BORDER_CONSTANT), np.float32)
+    small[..., :3] /= np.maximum(small[..., 3:], 1e-6)
+    return np.asarray(cv2.resize(small, (width, height)), np.float32)

@@ -26,7 +26,7 @@ from mass_engine.tracking.matting import refine_edge
 
 BACKGROUND, IGNORE, HAND = 0, 128, 255
 
-_WORK = 256  # longest side of the window in which masks are computed, pixels
+_WORK = 200  # longest side of the window in which masks are computed, pixels
 _EXPAND = 1.5  # window over the landmarks' bounding box
 _ROUNDS = 3
 _TIPS = slice(16, 21)  # the landmarks at the fingers' ends

@@ -51,35 +51,41 @@ def _matte(
     sure: float,
     reach: float,
 ) -> NDArray[np.float32]:
-    color = rgb.astype(np.float32)
     known_hand = (edge > sure) & (edge < 2.5 * reach) & ~ignore
     known_rest = (edge < -sure) & (edge > -2.5 * reach) & ~ignore
-    fore, back = (_local_mean(color, side, reach) for side in (known_hand, known_rest))
-    line = fore[..., :3] - back[..., :3]
-    contrast = np.einsum("hwc,hwc->hw", line, line)
-    place = np.einsum("hwc,hwc->hw", color - back[..., :3], line) / np.maximum(contrast, 1.0)
-    place = 0.5 + _GAIN * (place - 0.5)
-    known = np.minimum(fore[..., 3], back[..., 3]) > 0.01
-    trust = np.where(known, contrast / (contrast + _CONTRAST**2), 0.0).astype(np.float32)
-    alpha = trust * np.clip(place, 0.0, 1.0) + (1 - trust) * rough
-    alpha = np.where(np.abs(edge) < 1.5 * sure, alpha, edge > 0).astype(np.float32)
+    rows, columns = np.nonzero(np.abs(edge) < 1.5 * sure)
+    means = (_local_mean(rgb, side, reach) for side in (known_hand, known_rest))
+    fore, back = (
+        mean[np.minimum(rows // 2, mean.shape[0] - 1), np.minimum(columns // 2, mean.shape[1] - 1)]
+        for mean in means
+    )
+    line = fore[:, :3] - back[:, :3]
+    contrast = (line * line).sum(1)
+    place = ((rgb[rows, columns] - back[:, :3]) * line).sum(1) / np.maximum(contrast, 1.0)
+    place = np.clip(0.5 + _GAIN * (place - 0.5), 0.0, 1.0)
+    known = np.minimum(fore[:, 3], back[:, 3]) > 0.01
+    trust = np.where(known, contrast / (contrast + _CONTRAST**2), 0.0)
+    alpha = (edge > 0).astype(np.float32)
+    alpha[rows, columns] = trust * place + (1 - trust) * rough[rows, columns]
     # The contour this gives decides; softness only beside it.
     final = cv2.medianBlur((alpha > 0.5).astype(np.uint8), 3)
     far = _distance(final > 0)
     return np.where(np.abs(far) <= _BAND, alpha, far > 0).astype(np.float32)
 
 
-def _local_mean(color: NDArray[np.float32], use: NDArray[np.bool_], reach: float) -> NDArray[np.float32]:
-    """Mean colour of the used pixels up to ``reach`` away, and their share: [h,w,4].
+def _local_mean(rgb: NDArray[np.uint8], use: NDArray[np.bool_], reach: float) -> NDArray[np.float32]:
+    """Mean colour of the used pixels up to ``reach`` away, and their share: [h/2,w/2,4].
 
-    Sums are taken at half the size: a mean over so many pixels loses nothing by it.
+    At half the size: a mean over so many pixels loses nothing by it.
     """
     height, width = use.shape
     half = max(1, width // 2), max(1, height // 2)
-    weight = use.astype(np.float32)
-    stack = cv2.merge([*cv2.split(color * weight[..., None]), weight])
-    halved = cv2.resize(stack, half, interpolation=cv2.INTER_AREA)
+    weight = use.astype(np.uint8)
+    masked = cv2.bitwise_and(rgb, rgb, mask=weight)
+    stack = cv2.merge([*cv2.split(masked), 255 * weight])
+    halved = cv2.resize(stack, half, interpolation=cv2.INTER_AREA).astype(np.float32)
     size = 2 * max(1, round(reach / 2)) + 1
-    small = np.asarray(cv2.blur(halved, (size, size), borderType=cv2.BORDER_CONSTANT), np.float32)
-    small[..., :3] /= np.maximum(small[..., 3:], 1e-6)
-    return np.asarray(cv2.resize(small, (width, height)), np.float32)
+    mean = np.asarray(cv2.blur(halved, (size, size), borderType=cv2.BORDER_CONSTANT), np.float32)
+    mean[..., 3] /= 255
+    mean[..., :3] /= np.maximum(mean[..., 3:], 1e-6)
+    return mean

@@ -28,6 +28,7 @@ from mass_engine.tracking.alignment import align_landmarks, interpolate_pose
 from mass_engine.tracking.imports.load import load_tracks
 from mass_engine.tracking.landmarks import HandLandmarks
 from mass_engine.tracking.models import HandNetworks
+from mass_engine.tracking.sam_hq import Predictor, SamHqSegmenter, load_predictor
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE, HandMask, HandSegmenter, hand_box
 from mass_engine.tracking.track import Track, TrackBuilder
 from mass_engine.tracking.tracks import Tracks
@@ -66,6 +67,9 @@ class Clip:
 def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) -> Clip:
     """Read, track, judge, segment and align. Raises EngineError when the video cannot be used."""
     meter.update("read", 0.0)
+    # A wrong checkpoint is told before the long work.
+    wanted = None if options.masks is not None else options.segmenter_weights
+    network = None if wanted is None else load_predictor(wanted)
     template = load_template(parse_template(options.template))
     for code, message in template.notes:
         warn(code, message, "Look at the result with care.")
@@ -91,7 +95,7 @@ def prepare(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) 
     marks, times, quality = _landmarks(video, info, options, imported, meter, warn)
     model = template.model(marks[0].side)
     chosen, choice = _choose(marks, quality, times, options)
-    views = _cut_views(video, chosen, times, camera, options, meter)
+    views = _cut_views(video, chosen, times, camera, options, network, meter)
     # Shape parameters mean something else on another template: then only the landmarks are of use.
     if imported is None or imported.template != template.name:
         start = _align(model, views, chosen, camera, meter)
@@ -212,6 +216,7 @@ def _cut_views(
     times: dict[int, float],
     camera: Camera,
     options: FitOptions,
+    network: Predictor | None,
     meter: ProgressMeter,
 ) -> list[View]:
     """Second pass over the video: crops around the hand, then their masks."""
@@ -230,7 +235,10 @@ def _cut_views(
     if options.masks is None:
         train = [row for row, (mark, _, _) in enumerate(crops) if not options.is_heldout(mark.index)]
         picked = np.unique(np.linspace(0, len(train) - 1, min(MASK_SAMPLES, len(train))).round().astype(int))
+        segmenter: HandSegmenter | SamHqSegmenter
         segmenter = HandSegmenter.train([(crops[train[i]][2], moved[train[i]]) for i in picked])
+        if network is not None:
+            segmenter = SamHqSegmenter(segmenter, network)
         with ThreadPoolExecutor(2) as pool:
             masks = []
             for done, mask in enumerate(
@@ -256,15 +264,31 @@ def _view(
     camera: Camera,
 ) -> View:
     height, width = rgb.shape[:2]
-    labels = mask.full(height, width)
+    labels, coverage = mask.full(height, width), mask.full_coverage(height, width)
     view_camera = camera.crop(*box)
     scale = CROP_LIMIT / max(height, width)
     if scale < 1:
         size = max(1, round(width * scale)), max(1, round(height * scale))
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
         labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        coverage = np.asarray(cv2.resize(coverage, size, interpolation=cv2.INTER_AREA), np.float32)
+        # Where the reduced coverage decides, so do the labels.
+        labels = np.where(labels == IGNORE, IGNORE, np.where(coverage > 0.5, HAND, BACKGROUND)).astype(
+            np.uint8
+        )
         view_camera = view_camera.resized(*size)
-    return View(mark.index, time, heldout, rgb, labels, view_camera, mark.points, mark.score, mark.at_joints)
+    return View(
+        mark.index,
+        time,
+        heldout,
+        rgb,
+        labels,
+        view_camera,
+        mark.points,
+        mark.score,
+        mark.at_joints,
+        coverage,
+    )
 
 
 def _user_mask(directory: Path, index: int, box: tuple[int, int, int, int], camera: Camera) -> HandMask:
@@ -288,7 +312,7 @@ def _user_mask(directory: Path, index: int, box: tuple[int, int, int, int], came
     labels = np.full(part.shape, IGNORE, np.uint8)
     labels[part == 0] = BACKGROUND
     labels[part == 255] = HAND
-    return HandMask((0, 0, w, h), labels)
+    return HandMask((0, 0, w, h), labels, (labels == HAND).astype(np.float32))
 
 
 def _align(

@@ -1,0 +1,29 @@
+// The kernels of each instruction set. Each lives in one translation unit compiled with its own flags.
+#pragma once
+
+#include "decoder_types.hpp"
+
+namespace mass {
+
+struct DeformTable {
+    const char* name;
+    void (*decode)(const DecoderData&, float* out, int begin, int end);
+    void (*decode_backward)(const DecoderData&, const float* d_out, float* d_share, const DecoderSums&, int begin, int end);
+};
+
+#if defined(MASS_BUILD_X86)
+namespace avx512 {
+extern const DeformTable deform_table;
+}
+namespace avx2 {
+extern const DeformTable deform_table;
+}
+#endif
+namespace portable {
+extern const DeformTable deform_table;
+}
+namespace scalar {
+extern const DeformTable deform_table;
+}
+
+}  // namespace mass

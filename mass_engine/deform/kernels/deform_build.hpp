@@ -1,7 +1,7 @@
 #pragma once
 
 // Included by each isa_*.cpp after it has defined MASS_ISA and MASS_WIDTH: the whole kernel, once.
-#include "decoder.hpp"
+#include "posing.hpp"
 #include "tables.hpp"
 
 #define MASS_TEXT_(x) #x
@@ -9,6 +9,6 @@
 
 namespace mass::MASS_ISA {
 
-extern const DeformTable deform_table = {MASS_TEXT(MASS_ISA), decode, decode_backward};
+extern const DeformTable deform_table = {MASS_TEXT(MASS_ISA), decode, decode_backward, pose_surfels};
 
 }  // namespace mass::MASS_ISA

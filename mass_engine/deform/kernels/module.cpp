@@ -3,6 +3,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <memory>
@@ -18,6 +19,7 @@ namespace {
 
 using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using Index = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
 
 std::vector<const mass::DeformTable*> tables() {
     std::vector<const mass::DeformTable*> found;
@@ -114,6 +116,40 @@ public:
         take(pose_out, B * H);
     }
 
+    // `planes` are albedo, then harmonics, each [.., stride]; `center_units` is the camera's place and the two units.
+    void pose_surfels(const In& vertices, const Index& corners, const Index& places, const In& coefficients, const Index& bones,
+                      const In& rotations, const In& albedo, const In& harmonics, const In& opacities, const In& light,
+                      const std::vector<float>& center_units, int deformed_from, const In& share, const In& pose,
+                      const In& second, const In& second_bias, const In& head, const In& head_bias, Out& means, Out& tangents,
+                      Out& normals, Out& opacities_out, Out& colors, int threads) {
+        if (center_units.size() != 5) throw std::invalid_argument("center_units needs 5 numbers");
+        mass::PosingData d{};
+        d.vertices = vertices.data();
+        d.corners = corners.data();
+        d.places = places.data();
+        d.coefficients = coefficients.data();
+        d.bones = bones.data();
+        d.rotations = rotations.data();
+        d.albedo = albedo.data();
+        d.harmonics = harmonics.data();
+        d.opacities = opacities.data();
+        d.light = light.data();
+        for (std::size_t k = 0; k < 3; ++k) d.center[k] = center_units[k];
+        d.offset_unit = center_units[3];
+        d.rotation_unit = center_units[4];
+        d.count = static_cast<int>(means.shape(0));
+        d.stride = static_cast<int>(albedo.shape(1));
+        d.harmonics_count = static_cast<int>(harmonics.shape(0)) / 3;
+        d.deformed_from = deformed_from;
+        d.decoder = data(share, pose, second, second_bias);
+        const Weights weights(second, head, head_bias.data(), d.decoder.hidden);
+        d.decoder.head = weights.head.data();
+        d.decoder.head_bias = weights.head_bias.data();
+        const mass::PosedData out{means.data(), tangents.data(), normals.data(), opacities_out.data(), colors.data()};
+        nb::gil_scoped_release release;
+        each_chunk(d.count, threads, [&](int, int begin, int end) { table_->pose_surfels(d, out, begin, end); });
+    }
+
 private:
     static mass::DecoderData data(const In& share, const In& pose, const In& second, const In& second_bias) {
         mass::DecoderData d{};
@@ -144,7 +180,7 @@ private:
 }  // namespace
 
 NB_MODULE(_kernels, m) {
-    m.doc() = "The deformation's decoder: compiled kernels (see mass_engine.deform.decoder).";
+    m.doc() = "Compiled kernels of the deformation (see mass_engine.deform.decoder and posing).";
     // Kernels held by globals live until the process ends: not a leak worth a report.
     nb::set_leak_warnings(false);
     m.def("instruction_sets", [] {
@@ -156,5 +192,6 @@ NB_MODULE(_kernels, m) {
         .def(nb::init<const std::string&>(), nb::arg("instruction_set") = "auto")
         .def_prop_ro("instruction_set", &Kernels::instruction_set)
         .def("decode", &Kernels::decode)
-        .def("decode_backward", &Kernels::decode_backward);
+        .def("decode_backward", &Kernels::decode_backward)
+        .def("pose_surfels", &Kernels::pose_surfels);
 }

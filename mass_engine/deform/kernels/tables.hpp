@@ -1,7 +1,7 @@
 // The kernels of each instruction set. Each lives in one translation unit compiled with its own flags.
 #pragma once
 
-#include "decoder_types.hpp"
+#include "posing_types.hpp"
 
 namespace mass {
 
@@ -9,6 +9,7 @@ struct DeformTable {
     const char* name;
     void (*decode)(const DecoderData&, float* out, int begin, int end);
     void (*decode_backward)(const DecoderData&, const float* d_out, float* d_share, const DecoderSums&, int begin, int end);
+    void (*pose_surfels)(const PosingData&, const PosedData&, int begin, int end);
 };
 
 #if defined(MASS_BUILD_X86)

@@ -15,12 +15,13 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.deform.network import Deformation, DeformationConfig, UnitCube
-from mass_engine.deform.posing import MeshPose, PosableSurfels, ShadedSurfels
+from mass_engine.deform.posing import CompiledSurfels, MeshPose, PosableSurfels, ShadedSurfels
+from mass_engine.evaluation.raster_scene import framing_camera
 from mass_engine.hand.builtin import load_builtin
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
 from mass_engine.hand.poses import named_pose
-from mass_engine.raster import RasterOptions, rasterize
+from mass_engine.raster import RasterOptions, RenderOutput, rasterize
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import white_light
 
@@ -57,8 +58,9 @@ def run(argv: Sequence[str]) -> None:
     model = load_builtin("right")
     point = named_pose("point", "right")
     # Fingers up, back of the hand to the camera, filling the picture's height.
-    orient = torch.tensor([1.2092, -1.2092, -1.2092])
-    pose = HandPose(point.betas, orient, point.hand_pose, torch.tensor([0.0, 0.08, 0.25]), "right")
+    orient = torch.tensor([-1.2092, -1.2092, 1.2092])
+    pose = HandPose(point.betas, orient, point.hand_pose, torch.zeros(3), "right")
+    vertices = model.posed(pose).vertices
     print(f"{platform.machine()}, {os.cpu_count()} cores, median of {repeat} (least to greatest), ms\n")
     print("| surfels | deformed | size | pose to surfels | pose to pixels | frames a second |")
     print("|---|---|---|---|---|---|")
@@ -67,22 +69,21 @@ def run(argv: Sequence[str]) -> None:
         surfels = _surfels(model, binding, case)
         compiled = surfels.compiled()
 
-        def posed(
-            binding: MeshBinding = binding,
-            posing: Callable[[MeshPose], ShadedSurfels] = compiled.posed,
-        ) -> ShadedSurfels:
-            hand = model.posed(pose)
-            refined = binding.subdivision.apply(hand.vertices)
-            bones = hand.bone_transforms[:, :3, :3]
-            return posing(MeshPose(refined, bones, torch.zeros(3), pose.hand_pose, pose.betas))
-
         for width, height in SIZES:
-            camera = Camera.from_fov(width, height, 60.0)
+            camera = framing_camera(vertices, width, height)
 
-            def drawn(posed: Callable[[], ShadedSurfels] = posed, camera: Camera = camera) -> None:
+            def posed(
+                binding: MeshBinding = binding, compiled: CompiledSurfels = compiled, camera: Camera = camera
+            ) -> ShadedSurfels:
+                hand = model.posed(pose)
+                refined = binding.subdivision.apply(hand.vertices)
+                bones, center = hand.bone_transforms[:, :3, :3], -camera.world_to_camera[:3, 3]
+                return compiled.posed(MeshPose(refined, bones, center, pose.hand_pose, pose.betas))
+
+            def drawn(posed: Callable[[], ShadedSurfels] = posed, camera: Camera = camera) -> RenderOutput:
                 s = posed()
                 options = RasterOptions(cull_backfaces=True)
-                rasterize(s.means, s.tangents, s.opacities, s.colors, camera, options=options)
+                return rasterize(s.means, s.tangents, s.opacities, s.colors, camera, options=options)
 
             with torch.no_grad():
                 first, _, _ = _times(posed, repeat)

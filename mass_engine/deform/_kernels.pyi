@@ -18,6 +18,38 @@ class Kernels:
         threads: int,
         /,
     ) -> None: ...
+    def deform(
+        self,
+        means: Tensor,
+        tangents: Tensor,
+        normals: Tensor,
+        offset: Tensor,
+        log_scale: Tensor,
+        rotation: Tensor,
+        means_out: Tensor,
+        tangents_out: Tensor,
+        normals_out: Tensor,
+        threads: int,
+        /,
+    ) -> None: ...
+    def deform_backward(
+        self,
+        tangents: Tensor,
+        normals: Tensor,
+        offset: Tensor,
+        log_scale: Tensor,
+        rotation: Tensor,
+        d_means_out: Tensor,
+        d_tangents_out: Tensor,
+        d_normals_out: Tensor,
+        d_tangents: Tensor,
+        d_normals: Tensor,
+        d_offset: Tensor,
+        d_log_scale: Tensor,
+        d_rotation: Tensor,
+        threads: int,
+        /,
+    ) -> None: ...
     def pose_surfels(
         self,
         vertices: Tensor,

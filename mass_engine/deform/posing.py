@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mass_engine.deform.decoder import OUTPUTS, Layers, shared_kernels
 from mass_engine.deform.network import FrozenDeformation
-from mass_engine.deform.residuals import deform
+from mass_engine.deform.residuals import deform_reference
 from mass_engine.errors import BadArgumentError
 from mass_engine.raster.cpu import available_threads
 from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
@@ -114,7 +114,7 @@ class PosableSurfels:
                 start = self.deformed_from
                 residuals = self.deformation.residuals(pose.hand_pose[None], pose.betas[None])
                 moving = AttachedSurfels(*(v[None, start:] for v in _parts(surfels)))
-                moved = deform(moving, residuals)
+                moved = deform_reference(moving, residuals)
                 surfels = AttachedSurfels(
                     *(
                         torch.cat([old[:start], new[0]])

@@ -12,6 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mass_engine.deform import _kernels
+from mass_engine.deform.decoder import shared_kernels
+from mass_engine.errors import BadArgumentError
+from mass_engine.raster.cpu import available_threads
 from mass_engine.surfel.binding import AttachedSurfels
 
 
@@ -59,8 +63,62 @@ class _Mask(torch.autograd.Function):
         return torch.where((logit <= 0) | (gradient > 0), gradient * slope, torch.zeros_like(slope))
 
 
-def deform(surfels: AttachedSurfels, residuals: Residuals) -> AttachedSurfels:
-    """The deformed surfels; differentiable in both. Shapes [B,N] as in ``Residuals``.
+def deform(
+    surfels: AttachedSurfels,
+    residuals: Residuals,
+    *,
+    threads: int | None = None,
+    instruction_set: str = "auto",
+) -> AttachedSurfels:
+    """The deformed surfels; differentiable in both. Shapes [B,N] as in ``Residuals``, or any other [...].
+
+    float32 is compiled, anything else is ``deform_reference``. ``threads``: None is every core this process
+    may use. Raises BadArgumentError ``deform.shape`` and ``deform.instruction_set``.
+    """
+    tensors = (
+        surfels.means,
+        surfels.tangents,
+        surfels.normals,
+        residuals.offset,
+        residuals.log_scale,
+        residuals.rotation,
+    )
+    lead = surfels.means.shape[:-1]
+    shapes = tuple(tuple(tensor.shape) for tensor in tensors)
+    if shapes != tuple((*lead, *end) for end in ((3,), (2, 3), (3,), (3,), (2,), (3,))):
+        raise BadArgumentError(
+            "deform.shape", f"Surfels and residuals are {shapes}.", "Give a residual for each surfel."
+        )
+    if any(tensor.dtype != torch.float32 for tensor in tensors):
+        return deform_reference(surfels, residuals)
+    kernels = shared_kernels(instruction_set)
+    out = _Deform.apply(kernels, threads or available_threads(), *tensors)  # type: ignore[no-untyped-call]
+    return AttachedSurfels(*out)
+
+
+class _Deform(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, kernels: _kernels.Kernels, threads: int, *tensors: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        given = [tensor.detach().contiguous() for tensor in tensors]
+        means, tangents, normals = (torch.empty_like(tensor) for tensor in given[:3])
+        kernels.deform(*given, means, tangents, normals, threads)  # type: ignore[call-arg, arg-type]
+        ctx.kernels, ctx.threads = kernels, threads
+        ctx.save_for_backward(*given[1:])
+        return means, tangents, normals
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        given = ctx.saved_tensors
+        arrived = [gradient.contiguous() for gradient in gradients]
+        out = [torch.empty_like(tensor) for tensor in given]
+        ctx.kernels.deform_backward(*given, *arrived, *out, ctx.threads)
+        return (None, None, gradients[0], *out)
+
+
+def deform_reference(surfels: AttachedSurfels, residuals: Residuals) -> AttachedSurfels:
+    """As ``deform``, in plain torch and any dtype.
 
     The rotation by w is the Cayley one of a = w / 2, R v = v + 2 / (1 + |a|^2) (a x v + a x (a x v)): that of
     the quaternion (1, w / 2), normalised, exact and without a branch at zero. Scales multiply the tangents

@@ -9,6 +9,6 @@
 
 namespace mass::MASS_ISA {
 
-extern const DeformTable deform_table = {MASS_TEXT(MASS_ISA), decode, decode_backward, pose_surfels};
+extern const DeformTable deform_table = {MASS_TEXT(MASS_ISA), decode, decode_backward, deform, deform_backward, pose_surfels};
 
 }  // namespace mass::MASS_ISA

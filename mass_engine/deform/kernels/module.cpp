@@ -116,7 +116,27 @@ public:
         take(pose_out, B * H);
     }
 
-    // `planes` are albedo, then harmonics, each [.., stride]; `center_units` is the camera's place and the two units.
+    void deform(const In& means, const In& tangents, const In& normals, const In& offset, const In& log_scale,
+                const In& rotation, Out& means_out, Out& tangents_out, Out& normals_out, int threads) {
+        const mass::ResidualData d{means.data(), tangents.data(), normals.data(), offset.data(), log_scale.data(), rotation.data()};
+        float *m = means_out.data(), *t = tangents_out.data(), *n = normals_out.data();
+        const int rows = static_cast<int>(means.size() / 3);
+        nb::gil_scoped_release release;
+        each_chunk(rows, threads, [&](int, int begin, int end) { table_->deform(d, m, t, n, begin, end); });
+    }
+
+    void deform_backward(const In& tangents, const In& normals, const In& offset, const In& log_scale, const In& rotation,
+                         const In& d_means_in, const In& d_tangents_in, const In& d_normals_in, Out& d_tangents, Out& d_normals,
+                         Out& d_offset, Out& d_log_scale, Out& d_rotation, int threads) {
+        const mass::ResidualData d{nullptr, tangents.data(), normals.data(), offset.data(), log_scale.data(), rotation.data()};
+        const mass::ResidualGradient g{d_means_in.data(), d_tangents_in.data(), d_normals_in.data(), d_tangents.data(),
+                                       d_normals.data(), d_offset.data(), d_log_scale.data(), d_rotation.data()};
+        const int rows = static_cast<int>(normals.size() / 3);
+        nb::gil_scoped_release release;
+        each_chunk(rows, threads, [&](int, int begin, int end) { table_->deform_backward(d, g, begin, end); });
+    }
+
+    // `center_units` is the camera's place and the two units.
     void pose_surfels(const In& vertices, const Index& corners, const Index& places, const In& coefficients, const Index& bones,
                       const In& rotations, const In& albedo, const In& harmonics, const In& opacities, const In& light,
                       const std::vector<float>& center_units, int deformed_from, const In& share, const In& pose,
@@ -193,5 +213,7 @@ NB_MODULE(_kernels, m) {
         .def_prop_ro("instruction_set", &Kernels::instruction_set)
         .def("decode", &Kernels::decode)
         .def("decode_backward", &Kernels::decode_backward)
+        .def("deform", &Kernels::deform)
+        .def("deform_backward", &Kernels::deform_backward)
         .def("pose_surfels", &Kernels::pose_surfels);
 }

@@ -6,24 +6,9 @@
 #include "harmonics.hpp"
 #include "lookup.hpp"
 #include "posing_types.hpp"
+#include "residuals.hpp"
 
 namespace mass::MASS_ISA {
-
-struct V3 {
-    F x, y, z;
-};
-
-MASS_INLINE V3 add(const V3& a, const V3& b) { return {add(a.x, b.x), add(a.y, b.y), add(a.z, b.z)}; }
-MASS_INLINE V3 sub(const V3& a, const V3& b) { return {sub(a.x, b.x), sub(a.y, b.y), sub(a.z, b.z)}; }
-MASS_INLINE V3 mul(F k, const V3& a) { return {mul(k, a.x), mul(k, a.y), mul(k, a.z)}; }
-MASS_INLINE V3 fma(F k, const V3& a, const V3& b) { return {fma(k, a.x, b.x), fma(k, a.y, b.y), fma(k, a.z, b.z)}; }
-MASS_INLINE F dot(const V3& a, const V3& b) { return fma(a.x, b.x, fma(a.y, b.y, mul(a.z, b.z))); }
-MASS_INLINE V3 cross(const V3& a, const V3& b) {
-    return {fnma(a.z, b.y, mul(a.y, b.z)), fnma(a.x, b.z, mul(a.z, b.x)), fnma(a.y, b.x, mul(a.x, b.y))};
-}
-MASS_INLINE F safe_length(const V3& a) { return sqrt(add(dot(a, a), splat(1e-24f))); }
-
-MASS_INLINE F exp_neg(F x) { return exp2_neg(mul(x, splat(1.44269504f))); }  // e^x for x <= 0
 
 // 2^tanh(x)
 MASS_INLINE F scale_factor(F x) {
@@ -68,26 +53,14 @@ MASS_INLINE Surfels attached(const PosingData& d, int n) {
 
 // Change them by the decoder's outputs [16 surfels,16].
 MASS_INLINE void deform(const PosingData& d, const float* out, Surfels& s) {
-    const auto output = [&](int k) { return gather(out + k, kPaddedOutputs); };
-    const F length = safe_length(s.first), one = splat(1.0f);
-    const V3 n = s.normal, t = mul(div(one, length), s.first), b = cross(n, t);
-    const F along = dot(s.second, t), across = dot(s.second, b);
-
-    const F unit = splat(d.offset_unit);
-    s.mean = fma(mul(unit, output(0)), t, fma(mul(unit, output(1)), b, fma(mul(unit, output(2)), n, s.mean)));
-
-    const F half = splat(0.5f * d.rotation_unit);
-    const F x = mul(half, output(5)), y = mul(half, output(6)), z = mul(half, output(7));
-    const F xx = mul(x, x), yy = mul(y, y), zz = mul(z, z), xy = mul(x, y), xz = mul(x, z), yz = mul(y, z);
-    const F k = div(splat(2.0f), add(one, add(xx, add(yy, zz)))), minus = neg(k);
-    const auto turn = [&](F kt, F kb, F kn) { return fma(kt, t, fma(kb, b, mul(kn, n))); };
-    const V3 add_t = turn(mul(minus, add(yy, zz)), mul(k, add(xy, z)), mul(k, sub(xz, y)));
-    const V3 add_b = turn(mul(k, sub(xy, z)), mul(minus, add(xx, zz)), mul(k, add(yz, x)));
-    const V3 add_n = turn(mul(k, add(xz, y)), mul(k, sub(yz, x)), mul(minus, add(xx, yy)));
-    s.first = mul(scale_factor(output(3)), fma(length, add_t, s.first));
-    s.second = mul(scale_factor(output(4)), fma(along, add_t, fma(across, add_b, s.second)));
-    s.normal = add(n, add_n);
-    s.opacity = mul(s.opacity, opacity_mask(output(8)));
+    const auto output = [&](int k, float unit) { return mul(splat(unit), gather(out + k, kPaddedOutputs)); };
+    Change change;
+    change.offset = {output(0, d.offset_unit), output(1, d.offset_unit), output(2, d.offset_unit)};
+    change.first_scale = scale_factor(output(3, 1.0f));
+    change.second_scale = scale_factor(output(4, 1.0f));
+    change.rotation = {output(5, d.rotation_unit), output(6, d.rotation_unit), output(7, d.rotation_unit)};
+    apply(change, s.mean, s.first, s.second, s.normal);
+    s.opacity = mul(s.opacity, opacity_mask(output(8, 1.0f)));
 }
 
 MASS_INLINE void shade(const PosingData& d, const Surfels& s, int n, F* color) {
@@ -113,22 +86,6 @@ MASS_INLINE void shade(const PosingData& d, const Surfels& s, int n, F* color) {
             color[c] = fma(Y[k + 1], load(d.harmonics + static_cast<long>(3 * k + c) * d.stride + n), color[c]);
         }
         color[c] = max(color[c], zero);
-    }
-}
-
-// `out[row, width]` = lanes of `values[width]`, the first `count` of them.
-template <int width>
-MASS_INLINE void interleave(const F* values, int count, float* out) {
-    alignas(64) float lanes[width][kLanes];
-    for (int k = 0; k < width; ++k) store(lanes[k], values[k]);
-    if (count == kLanes) {
-        for (int l = 0; l < kLanes; ++l) {
-            for (int k = 0; k < width; ++k) out[l * width + k] = lanes[k][l];
-        }
-    } else {
-        for (int l = 0; l < count; ++l) {
-            for (int k = 0; k < width; ++k) out[l * width + k] = lanes[k][l];
-        }
     }
 }
 

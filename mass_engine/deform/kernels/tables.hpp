@@ -2,6 +2,7 @@
 #pragma once
 
 #include "posing_types.hpp"
+#include "residual_types.hpp"
 
 namespace mass {
 
@@ -9,6 +10,8 @@ struct DeformTable {
     const char* name;
     void (*decode)(const DecoderData&, float* out, int begin, int end);
     void (*decode_backward)(const DecoderData&, const float* d_out, float* d_share, const DecoderSums&, int begin, int end);
+    void (*deform)(const ResidualData&, float* means, float* tangents, float* normals, int begin, int end);
+    void (*deform_backward)(const ResidualData&, const ResidualGradient&, int begin, int end);
     void (*pose_surfels)(const PosingData&, const PosedData&, int begin, int end);
 };
 

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from mass_engine.deform import _kernels
 from mass_engine.deform.network import DeformationConfig
-from mass_engine.deform.residuals import Residuals, deform, opacity_mask
+from mass_engine.deform.residuals import Residuals, deform, deform_reference, opacity_mask
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.hand.rotation import axis_angle_to_matrix
 from mass_engine.surfel.binding import AttachedSurfels
@@ -140,6 +141,42 @@ def test_gradients_agree_with_finite_differences() -> None:
     assert gradcheck(run, tuple(value.detach().clone().requires_grad_() for value in inputs))
 
 
+@pytest.mark.parametrize("instruction_set", _kernels.instruction_sets())
+@pytest.mark.parametrize("threads", [1, 3])
+def test_compiled_it_agrees_with_the_specification(instruction_set: str, threads: int) -> None:
+    surfels, *_ = rest_surfels()
+    generator = torch.Generator().manual_seed(2)
+    count = 1999
+    rows = torch.randint(0, len(surfels.means), (2, count), generator=generator)
+    inputs = [surfels.means[rows], surfels.tangents[rows], surfels.normals[rows]]
+    scales = {"offset": 1e-3, "log_scale": 0.4, "rotation": 0.5}
+    inputs += [
+        torch.randn(2, count, 2 if name == "log_scale" else 3, generator=generator) * scale
+        for name, scale in scales.items()
+    ]
+    weights = [torch.randn(value.shape, generator=generator) for value in inputs[:3]]
+    weights[1] *= 1e3  # tangents are tenths of a millimetre
+
+    def run(values: list[Tensor], compiled: bool) -> list[Tensor]:
+        values = [value.clone().requires_grad_() for value in values]
+        offset, log_scale, rotation = values[3:]
+        residuals = Residuals(offset, log_scale, rotation, torch.zeros(2, count))
+        given = AttachedSurfels(*values[:3]), residuals
+        if compiled:
+            after = deform(*given, threads=threads, instruction_set=instruction_set)
+        else:
+            after = deform_reference(*given)
+        out = [after.means, after.tangents, after.normals]
+        total = sum((x * w.to(x.dtype)).sum() for x, w in zip(out, weights, strict=True))
+        assert isinstance(total, Tensor)
+        return [*(x.detach() for x in out), *torch.autograd.grad(total, values)]
+
+    exact = run([value.double() for value in inputs], compiled=False)
+    for value, truth in zip(run(inputs, compiled=True), exact, strict=True):
+        assert value.shape == truth.shape
+        assert float((value - truth).abs().max()) <= 2e-6 * float(truth.abs().max())
+
+
 def test_gradients_of_the_whole_module_agree_with_finite_differences() -> None:
     module = trained(count=4).double()
     names = [name for name, _ in module.named_parameters()]
@@ -185,6 +222,9 @@ def test_weights_travel_through_a_flat_dict() -> None:
 def test_bad_input_is_refused() -> None:
     with pytest.raises(BadArgumentError, match=r"deform\.pose"):
         deformation()(torch.zeros(1, 48), torch.zeros(1, 10))
+    surfels, *_ = rest_surfels()
+    with pytest.raises(BadArgumentError, match=r"deform\.shape"):
+        deform(batched(surfels, 5), Residuals(**nothing(4)))
     with pytest.raises(BadArgumentError, match=r"deform\.config"):
         DeformationConfig(hidden=17)
     with pytest.raises(BadArgumentError, match=r"deform\.config"):

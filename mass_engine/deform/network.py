@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mass_engine.deform.decoder import OUTPUTS, Layers, decode
+from mass_engine.deform.decoder import OUTPUTS, Layers, Units, decode
 from mass_engine.deform.hashgrid import HashGrid, HashGridConfig
 from mass_engine.deform.residuals import Residuals
 from mass_engine.errors import BadArgumentError, EngineError
@@ -189,11 +189,5 @@ class FrozenDeformation:
 
     def residuals(self, hand_pose: Tensor, betas: Tensor) -> Residuals:
         """Residuals [B,N] for ``hand_pose`` [B,45] and ``betas`` [B,10]."""
-        out = decode(self.surfel_share, self.pose_share(hand_pose, betas), self.layers)
-        offset, log_scale, rotation, mask_logit = out.split([3, 2, 3, 1], -1)
-        return Residuals(
-            offset * self.config.offset_unit,
-            torch.tanh(log_scale) * math.log(2),
-            rotation * self.config.rotation_unit,
-            mask_logit.squeeze(-1),
-        )
+        units = Units(self.config.offset_unit, self.config.rotation_unit)
+        return decode(self.surfel_share, self.pose_share(hand_pose, betas), self.layers, units)

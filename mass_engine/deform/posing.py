@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mass_engine.deform.decoder import OUTPUTS, Layers, shared_kernels
+from mass_engine.deform.decoder import OUTPUTS, Layers
+from mass_engine.deform.native import shared_kernels
 from mass_engine.deform.network import FrozenDeformation
 from mass_engine.deform.residuals import deform_reference
 from mass_engine.errors import BadArgumentError

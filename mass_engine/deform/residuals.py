@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mass_engine.deform import _kernels
-from mass_engine.deform.decoder import shared_kernels
+from mass_engine.deform.native import shared_kernels
 from mass_engine.errors import BadArgumentError
 from mass_engine.raster.cpu import available_threads
 from mass_engine.surfel.binding import AttachedSurfels

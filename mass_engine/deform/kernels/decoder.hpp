@@ -4,6 +4,7 @@
 
 #include "decoder_types.hpp"
 #include "layers.hpp"
+#include "vectors.hpp"
 
 namespace mass::MASS_ISA {
 
@@ -32,23 +33,76 @@ MASS_INLINE void decode_block(const DecoderData& d, int b, int first, int count,
             [&](int row, int column, F x) { store(out + row * kPaddedOutputs + column, x); });
 }
 
-// Surfels [begin, end) in every pose; out [B,N,9].
-inline void decode(const DecoderData& d, float* out, int begin, int end) {
+inline constexpr float kLog2 = 0.69314718f;
+
+MASS_INLINE F tanh_of(F x) {
+    const F q = exp_neg(mul(splat(-2.0f), abs(x))), one = splat(1.0f);
+    const F t = div(sub(one, q), add(one, q));
+    return select(lt(x, splat(0.0f)), neg(t), t);
+}
+
+// Residuals of sixteen surfels from the decoder's outputs [16 surfels,16].
+struct Outputs {
+    F offset[3], log_scale[2], rotation[3], mask_logit;
+};
+
+MASS_INLINE Outputs residuals_of(const DecoderData& d, const float* block) {
+    const auto output = [&](int k) { return gather(block + k, kPaddedOutputs); };
+    Outputs o;
+    for (int k = 0; k < 3; ++k) o.offset[k] = mul(splat(d.offset_unit), output(k));
+    for (int k = 0; k < 2; ++k) o.log_scale[k] = mul(splat(kLog2), tanh_of(output(3 + k)));
+    for (int k = 0; k < 3; ++k) o.rotation[k] = mul(splat(d.rotation_unit), output(5 + k));
+    o.mask_logit = output(8);
+    return o;
+}
+
+// Surfels [begin, end) in every pose.
+inline void decode(const DecoderData& d, const ResidualRows& out, int begin, int end) {
     alignas(64) float block[kBlockRows * kPaddedOutputs];
     for (int first = begin; first < end; first += kBlockRows) {
-        const int count = end - first < kBlockRows ? end - first : kBlockRows;
+        const int rows = end - first < kBlockRows ? end - first : kBlockRows;
         for (int b = 0; b < d.batch; ++b) {
-            decode_block(d, b, first, count, block);
-            float* rows = out + (static_cast<long>(b) * d.count + first) * kOutputs;
-            for (int row = 0; row < count; ++row) {
-                std::memcpy(rows + row * kOutputs, block + row * kPaddedOutputs, kOutputs * sizeof(float));
+            decode_block(d, b, first, rows, block);
+            for (int row = 0; row < rows; row += kLanes) {
+                const int count = rows - row < kLanes ? rows - row : kLanes;
+                const long at = static_cast<long>(b) * d.count + first + row;
+                const Outputs o = residuals_of(d, block + row * kPaddedOutputs);
+                interleave<3>(o.offset, count, out.offset + 3 * at);
+                interleave<2>(o.log_scale, count, out.log_scale + 2 * at);
+                interleave<3>(o.rotation, count, out.rotation + 3 * at);
+                interleave<1>(&o.mask_logit, count, out.mask_logit + at);
             }
         }
     }
 }
 
-// Gradients from d_out [B,N,9]: d_share [N,H] of surfels [begin, end), and this chunk's sums of the rest.
-inline void decode_backward(const DecoderData& d, const float* d_out, float* d_share, const DecoderSums& sums, int begin,
+// Gradients of the decoder's outputs [48,9] of `rows` surfels from those of the residuals; zero beyond.
+MASS_INLINE void output_gradients(const DecoderData& d, const ResidualRowGradients& g, long at, int rows, float* block) {
+    for (int row = 0; row < kBlockRows; row += kLanes) {
+        const int left = rows - row, count = left < 0 ? 0 : (left < kLanes ? left : kLanes);
+        const long here = at + row;
+        F out[kOutputs], log_scale[2];
+        if (count == 0) {
+            std::memset(block + row * kOutputs, 0, kLanes * kOutputs * sizeof(float));
+            continue;
+        }
+        load_rows<3>(g.offset + 3 * here, count, out);
+        load_rows<2>(g.log_scale + 2 * here, count, out + 3);
+        load_rows<3>(g.rotation + 3 * here, count, out + 5);
+        load_rows<1>(g.mask_logit + here, count, out + 8);
+        load_rows<2>(g.log_scale_value + 2 * here, count, log_scale);
+        for (int k = 0; k < 3; ++k) out[k] = mul(splat(d.offset_unit), out[k]);
+        for (int k = 0; k < 2; ++k) {
+            const F slope = fnma(mul(log_scale[k], log_scale[k]), splat(1.0f / kLog2), splat(kLog2));
+            out[3 + k] = mul(slope, out[3 + k]);
+        }
+        for (int k = 0; k < 3; ++k) out[5 + k] = mul(splat(d.rotation_unit), out[5 + k]);
+        interleave<kOutputs>(out, kLanes, block + row * kOutputs);
+    }
+}
+
+// Gradients: d_share [N,H] of surfels [begin, end), and this chunk's sums of the rest.
+inline void decode_backward(const DecoderData& d, const ResidualRowGradients& given, float* d_share, const DecoderSums& sums, int begin,
                             int end) {
     constexpr int kOuterRows = MASS_WIDTH == 16 ? 8 : kRows;
     const int H = d.hidden;
@@ -61,10 +115,7 @@ inline void decode_backward(const DecoderData& d, const float* d_out, float* d_s
         for (int b = 0; b < d.batch; ++b) {
             first_layer(d.share + static_cast<long>(first) * H, d.pose + b * H, count, H, hidden);
             second_layer(d, hidden, count, refined);
-            const std::size_t given = static_cast<std::size_t>(count) * kOutputs;
-            std::memcpy(d_block, d_out + (static_cast<long>(b) * d.count + first) * kOutputs, given * sizeof(float));
-            for (std::size_t k = given; k < kBlockRows * kOutputs; ++k) d_block[k] = 0.0f;
-
+            output_gradients(d, given, static_cast<long>(b) * d.count + first, count, d_block);
             for (int k = 0; k < kOutputs; ++k) {
                 for (int row = 0; row < count; ++row) sums.head_bias[k] += d_block[row * kOutputs + k];
             }

@@ -11,7 +11,8 @@ inline constexpr int kBlockRows = 48;
 // Rows per unit of work, whole blocks; fixed, so that sums do not depend on the thread count.
 inline constexpr int kDecoderChunk = 20 * kBlockRows;
 
-// out[b, n] = head(relu(second(relu(share[n] + pose[b])))); H = hidden.
+// x[b, n] = head(relu(second(relu(share[n] + pose[b])))); H = hidden. Residuals are of x: offset_unit x[0:3],
+// log 2 tanh x[3:5], rotation_unit x[5:8], x[8].
 struct DecoderData {
     const float* share;  // [N,H]
     const float* pose;   // [B,H]
@@ -21,7 +22,18 @@ struct DecoderData {
     const float* head_bias;  // [16]
     const float* second_transposed;  // [H,H], backward only
     const float* head_transposed;    // [9,H], backward only
+    float offset_unit, rotation_unit;
     int count, batch, hidden;        // N, B, H (a multiple of 16)
+};
+
+// [B,N,3], [B,N,2], [B,N,3], [B,N]
+struct ResidualRows {
+    float *offset, *log_scale, *rotation, *mask_logit;
+};
+
+// Their gradients, and the log-scales themselves, which know their own slope.
+struct ResidualRowGradients {
+    const float *offset, *log_scale, *rotation, *mask_logit, *log_scale_value;
 };
 
 // Offsets of one chunk's sums of gradients in floats.

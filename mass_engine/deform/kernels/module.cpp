@@ -61,20 +61,21 @@ public:
     std::string instruction_set() const { return table_->name; }
 
     void decode(const In& share, const In& pose, const In& second, const In& second_bias, const In& head, const In& head_bias,
-                Out& out, int threads) {
-        mass::DecoderData d = data(share, pose, second, second_bias);
+                float offset_unit, float rotation_unit, Out& offset, Out& log_scale, Out& rotation, Out& mask_logit, int threads) {
+        mass::DecoderData d = data(share, pose, second, second_bias, offset_unit, rotation_unit);
         const Weights weights(second, head, head_bias.data(), d.hidden);
         d.head = weights.head.data();
         d.head_bias = weights.head_bias.data();
-        float* result = out.data();
+        const mass::ResidualRows out{offset.data(), log_scale.data(), rotation.data(), mask_logit.data()};
         nb::gil_scoped_release release;
-        each_chunk(d.count, threads, [&](int, int begin, int end) { table_->decode(d, result, begin, end); });
+        each_chunk(d.count, threads, [&](int, int begin, int end) { table_->decode(d, out, begin, end); });
     }
 
     void decode_backward(const In& share, const In& pose, const In& second, const In& second_bias, const In& head,
-                         const In& d_out, Out& d_share, Out& d_pose, Out& d_second, Out& d_second_bias, Out& d_head,
+                         float offset_unit, float rotation_unit, const In& d_offset, const In& d_log_scale,
+                         const In& d_rotation, const In& d_mask_logit, const In& log_scale, Out& d_share, Out& d_pose, Out& d_second, Out& d_second_bias, Out& d_head,
                          Out& d_head_bias, int threads) {
-        mass::DecoderData d = data(share, pose, second, second_bias);
+        mass::DecoderData d = data(share, pose, second, second_bias, offset_unit, rotation_unit);
         const Weights weights(second, head, nullptr, d.hidden);
         d.second_transposed = weights.second_transposed.data();
         d.head_transposed = weights.head_transposed.data();
@@ -82,7 +83,8 @@ public:
         const auto size = static_cast<std::size_t>(mass::DecoderSums::size(d.hidden, d.batch));
         float *share_out = d_share.data(), *pose_out = d_pose.data(), *second_out = d_second.data();
         float *second_bias_out = d_second_bias.data(), *head_out = d_head.data(), *head_bias_out = d_head_bias.data();
-        const float* gradient = d_out.data();
+        const mass::ResidualRowGradients gradient{d_offset.data(), d_log_scale.data(), d_rotation.data(), d_mask_logit.data(),
+                                                  log_scale.data()};
         nb::gil_scoped_release release;
         const auto chunks = static_cast<std::size_t>(chunk_count(d.count));
         std::vector<float> partial(chunks * size, 0.0f);
@@ -155,13 +157,11 @@ public:
         d.opacities = opacities.data();
         d.light = light.data();
         for (std::size_t k = 0; k < 3; ++k) d.center[k] = center_units[k];
-        d.offset_unit = center_units[3];
-        d.rotation_unit = center_units[4];
         d.count = static_cast<int>(means.shape(0));
         d.stride = static_cast<int>(albedo.shape(1));
         d.harmonics_count = static_cast<int>(harmonics.shape(0)) / 3;
         d.deformed_from = deformed_from;
-        d.decoder = data(share, pose, second, second_bias);
+        d.decoder = data(share, pose, second, second_bias, center_units[3], center_units[4]);
         const Weights weights(second, head, head_bias.data(), d.decoder.hidden);
         d.decoder.head = weights.head.data();
         d.decoder.head_bias = weights.head_bias.data();
@@ -171,7 +171,8 @@ public:
     }
 
 private:
-    static mass::DecoderData data(const In& share, const In& pose, const In& second, const In& second_bias) {
+    static mass::DecoderData data(const In& share, const In& pose, const In& second, const In& second_bias, float offset_unit,
+                                  float rotation_unit) {
         mass::DecoderData d{};
         d.share = share.data();
         d.pose = pose.data();
@@ -180,6 +181,8 @@ private:
         d.count = static_cast<int>(share.shape(0));
         d.hidden = static_cast<int>(share.shape(1));
         d.batch = static_cast<int>(pose.shape(0));
+        d.offset_unit = offset_unit;
+        d.rotation_unit = rotation_unit;
         return d;
     }
 

@@ -10,14 +10,6 @@
 
 namespace mass::MASS_ISA {
 
-// 2^tanh(x)
-MASS_INLINE F scale_factor(F x) {
-    const F q = exp_neg(mul(splat(-2.0f), abs(x))), one = splat(1.0f);
-    const F t = div(sub(one, q), add(one, q));
-    const F tanh = select(lt(x, splat(0.0f)), neg(t), t);
-    return mul(splat(2.0f), exp2_neg(sub(tanh, one)));
-}
-
 // min(1, 2 / (1 + e^-x))
 MASS_INLINE F opacity_mask(F x) {
     const F q = exp_neg(min(x, splat(0.0f)));
@@ -52,15 +44,14 @@ MASS_INLINE Surfels attached(const PosingData& d, int n) {
 }
 
 // Change them by the decoder's outputs [16 surfels,16].
-MASS_INLINE void deform(const PosingData& d, const float* out, Surfels& s) {
-    const auto output = [&](int k, float unit) { return mul(splat(unit), gather(out + k, kPaddedOutputs)); };
-    Change change;
-    change.offset = {output(0, d.offset_unit), output(1, d.offset_unit), output(2, d.offset_unit)};
-    change.first_scale = scale_factor(output(3, 1.0f));
-    change.second_scale = scale_factor(output(4, 1.0f));
-    change.rotation = {output(5, d.rotation_unit), output(6, d.rotation_unit), output(7, d.rotation_unit)};
+MASS_INLINE void deform(const PosingData& d, const float* block, Surfels& s) {
+    const Outputs o = residuals_of(d.decoder, block);
+    const Change change = {{o.offset[0], o.offset[1], o.offset[2]},
+                           exp_any(o.log_scale[0]),
+                           exp_any(o.log_scale[1]),
+                           {o.rotation[0], o.rotation[1], o.rotation[2]}};
     apply(change, s.mean, s.first, s.second, s.normal);
-    s.opacity = mul(s.opacity, opacity_mask(output(8, 1.0f)));
+    s.opacity = mul(s.opacity, opacity_mask(o.mask_logit));
 }
 
 MASS_INLINE void shade(const PosingData& d, const Surfels& s, int n, F* color) {

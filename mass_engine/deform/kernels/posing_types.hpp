@@ -25,7 +25,6 @@ struct PosingData {
     int count, stride, harmonics_count;  // M, -, K: 0, 3, 8 or 15
     DecoderData decoder;          // one pose; its row n is surfel deformed_from + n
     int deformed_from;            // M: none is deformed
-    float offset_unit, rotation_unit;
 };
 
 struct PosedData {

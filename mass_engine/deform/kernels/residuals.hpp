@@ -62,11 +62,6 @@ MASS_INLINE void apply(const Change& c, V3& mean, V3& first, V3& second, V3& nor
     normal = add(normal, r.add_n);
 }
 
-MASS_INLINE F exp_any(F x) {
-    const F e = exp_neg(neg(abs(x)));
-    return select(lt(x, splat(0.0f)), e, div(splat(1.0f), e));
-}
-
 template <int width>
 MASS_INLINE void load_vectors(const float* in, int row, int count, V3* out) {
     F values[3 * width];

@@ -8,8 +8,9 @@ namespace mass {
 
 struct DeformTable {
     const char* name;
-    void (*decode)(const DecoderData&, float* out, int begin, int end);
-    void (*decode_backward)(const DecoderData&, const float* d_out, float* d_share, const DecoderSums&, int begin, int end);
+    void (*decode)(const DecoderData&, const ResidualRows&, int begin, int end);
+    void (*decode_backward)(const DecoderData&, const ResidualRowGradients&, float* d_share, const DecoderSums&, int begin,
+                            int end);
     void (*deform)(const ResidualData&, float* means, float* tangents, float* normals, int begin, int end);
     void (*deform_backward)(const ResidualData&, const ResidualGradient&, int begin, int end);
     void (*pose_surfels)(const PosingData&, const PosedData&, int begin, int end);

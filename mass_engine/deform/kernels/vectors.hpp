@@ -21,6 +21,11 @@ MASS_INLINE F safe_length(const V3& a) { return sqrt(add(dot(a, a), splat(1e-24f
 
 MASS_INLINE F exp_neg(F x) { return exp2_neg(mul(x, splat(1.44269504f))); }  // e^x for x <= 0
 
+MASS_INLINE F exp_any(F x) {
+    const F e = exp_neg(neg(abs(x)));
+    return select(lt(x, splat(0.0f)), e, div(splat(1.0f), e));
+}
+
 // Lanes of `values[width]` = in[row, width] of the first `count` rows; lanes beyond are zero.
 template <int width>
 MASS_INLINE void load_rows(const float* in, int count, F* values) {

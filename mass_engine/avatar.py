@@ -35,6 +35,7 @@ from mass_engine.raster import RasterOptions, RenderOutput, rasterize
 from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
 from mass_engine.surfel.cloud import SurfelCloud
 from mass_engine.surfel.harmonics import rgb_to_sh0
+from mass_engine.threads import one_thread
 from mass_engine.viewpoint import parse_camera
 
 FILE_NAME = "avatar.safetensors"
@@ -116,7 +117,7 @@ class Avatar:
 
     def _shaded(self, pose: HandPose, camera: Camera) -> ShadedSurfels:
         """The kept surfels in one pose (a batch of one) as ``camera`` sees them."""
-        with torch.no_grad():
+        with torch.no_grad(), one_thread():
             hand = self.shape.model.posed(pose, self.shape.offsets())
             refined = self.binding.subdivision.apply(hand.vertices)[0]
             center = -camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3]

@@ -24,6 +24,7 @@ from mass_engine.hand.poses import named_pose
 from mass_engine.raster import RasterOptions, RenderOutput, rasterize
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import white_light
+from mass_engine.threads import one_thread
 
 SIZES = ((256, 256), (512, 334), (512, 512), (1400, 1000))
 
@@ -75,8 +76,9 @@ def run(argv: Sequence[str]) -> None:
             def posed(
                 binding: MeshBinding = binding, compiled: CompiledSurfels = compiled, camera: Camera = camera
             ) -> ShadedSurfels:
-                hand = model.posed(pose)
-                refined = binding.subdivision.apply(hand.vertices)
+                with one_thread():
+                    hand = model.posed(pose)
+                    refined = binding.subdivision.apply(hand.vertices)
                 bones, center = hand.bone_transforms[:, :3, :3], -camera.world_to_camera[:3, 3]
                 return compiled.posed(MeshPose(refined, bones, center, pose.hand_pose, pose.betas))
 

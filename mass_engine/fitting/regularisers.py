@@ -50,22 +50,44 @@ def face_normals(triangles: Tensor) -> Tensor:
 def triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
     """Distance [...] in metres from ``points`` [...,3] to ``triangles`` [...,3 corners,3], solid ones.
 
-    The height over the plane where the point's foot lies inside, else the distance of the nearest edge. At
-    zero it has the gradient 0.
+    At zero it has the gradient 0.
     """
-    corners = triangles
-    following = triangles.roll(-1, -2)
-    edges, to_point = following - corners, points.unsqueeze(-2) - corners
-    normal = face_normals(triangles)
-    # The foot is inside when it lies to the left of all three edges.
-    side = (torch.linalg.cross(normal.unsqueeze(-2).expand_as(edges), edges) * to_point).sum(-1)
-    inside = (side >= 0).all(-1)
-    height = (to_point[..., 0, :] * normal).sum(-1).square()
-    along = (to_point * edges).sum(-1) / (edges.square().sum(-1) + 1e-30)
-    to_edge = to_point - along.clamp(0, 1).unsqueeze(-1) * edges
-    squared = torch.where(inside, height, to_edge.square().sum(-1).amin(-1))
+    # The nearest point minimises the distance, so its place in the triangle needs no gradient of its own.
+    with torch.no_grad():
+        places = _nearest_places(points, triangles)
+    away = points - (places.unsqueeze(-1) * triangles).sum(-2)
+    squared = away.square().sum(-1)
     touching = squared <= 1e-20
     return torch.where(touching, torch.zeros_like(squared), torch.where(touching, 1.0, squared).sqrt())
+
+
+def _nearest_places(points: Tensor, triangles: Tensor) -> Tensor:
+    """Barycentric coordinates [...,3] of the point of each triangle that is nearest to ``points``."""
+    p = points.movedim(-1, 0).contiguous()
+    corners = triangles.movedim((-2, -1), (0, 1)).contiguous()
+
+    def dot(u: Tensor, v: Tensor) -> Tensor:
+        return (u * v).sum(0)
+
+    ab, ac, ap = corners[1] - corners[0], corners[2] - corners[0], p - corners[0]
+    bb, bc, cc, pb, pc = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ap, ab), dot(ap, ac)
+    least = 1e-30
+    scale = (bb * cc - bc * bc).clamp_min(least)
+    u, v = (cc * pb - bc * pc) / scale, (bb * pc - bc * pb) / scale
+    places = torch.stack([1 - u - v, u, v])
+    best = torch.where((places >= 0).all(0), torch.zeros_like(u), torch.full_like(u, torch.inf))
+    # Feet on the three lines through the corners, kept within the edges.
+    for start in range(3):
+        end = (start + 1) % 3
+        edge, off = corners[end] - corners[start], p - corners[start]
+        along = (dot(off, edge) / dot(edge, edge).clamp_min(least)).clamp(0, 1)
+        distance = (off - along * edge).square().sum(0)
+        place = torch.zeros_like(places)
+        place[start], place[end] = 1 - along, along
+        nearer = distance < best
+        best = torch.where(nearer, distance, best)
+        places = torch.where(nearer, place, places)
+    return places.movedim(0, -1)
 
 
 def depth_distortion(

@@ -52,7 +52,7 @@ def test_a_fit_starts_from_wilor_s_poses(demo_clip: Path, draft_run: Path, tmp_p
         ProgressMeter(lambda _: None),
         lambda code, *_: warned.append(code),
     )
-    assert clip.fov_assumed
+    assert clip.fov_source == "assumed"
     expected = {"mano": [], "builtin": ["tracks.joints_only"], "rotations": ["tracks.rotations_only"]}
     assert warned == expected[kind]
     rows = [own.indices.index(view.index) for view in clip.views]

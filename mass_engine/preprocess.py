@@ -225,7 +225,7 @@ def _align(
         camera,
         betas=main.betas[0],
         start=start,
-        iterations=150,
+        iterations=100,
         progress=lambda fraction: meter.update("align", 0.8 + 0.2 * fraction),
     ).pose
     order = torch.tensor(train + held).argsort()

@@ -106,7 +106,7 @@ def align_landmarks(
     *,
     betas: Tensor | None = None,
     start: HandPose | None = None,
-    iterations: int = 400,
+    iterations: int = 200,
     weights: AlignmentWeights | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Alignment:
@@ -132,16 +132,17 @@ def align_landmarks(
     depth0 = begin.transl[:, 2:].clamp_min(0.05)
     shift = torch.zeros_like(begin.transl)
     groups = [
-        {"params": [orient], "lr": 0.03},
-        {"params": [fingers], "lr": 0.03},
-        {"params": [shift], "lr": 0.01},
+        {"params": [orient], "lr": 0.09},
+        {"params": [fingers], "lr": 0.09},
+        {"params": [shift], "lr": 0.03},
     ]
     if betas is None:
-        groups.append({"params": [free_betas], "lr": 0.03})
+        groups.append({"params": [free_betas], "lr": 0.09})
     for group in groups:
         for parameter in group["params"]:  # type: ignore[attr-defined]
             parameter.requires_grad_(True)
-    optimizer = torch.optim.Adam(groups)
+    # A short memory of gradients: rates this high would not settle with the usual one.
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations, eta_min=1e-3)
     error = torch.zeros(len(landmarks))
 
@@ -152,8 +153,10 @@ def align_landmarks(
 
     for iteration in range(iterations):
         optimizer.zero_grad(set_to_none=True)
-        # Fingers bend only once the palm is in place: else they explain the palm's error.
-        finger_share = min(1.0, max(0.0, (iteration / iterations - 0.15) / 0.1))
+        # Fingers bend only once the palm is in place: else they explain the palm's error. A given start has
+        # them bent.
+        ramp = min(1.0, max(0.0, (iteration / iterations - 0.15) / 0.1))
+        finger_share = 1.0 if start is not None else ramp
         current = pose()
         if finger_share < 1.0:
             current = replace(current, hand_pose=fingers * finger_share)

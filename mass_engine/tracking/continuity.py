@@ -27,6 +27,8 @@ _STEP = 3  # frames apart at most: held-out frames are stepped over
 #: are tracked well it stays under 0.06, at changes of mind it is 0.1 to 0.7.
 _BREAK = 0.09
 _QUIET = 0.04  # the same distance below which landmarks are believed without asking the picture
+#: A break this large is a change of mind; a smaller one may be fast motion that flow does not follow.
+_MISREAD = 0.14
 _ANCHOR = 12  # frames: runs as long as this are believed
 _LONGEST_BRIDGE = 30  # frames: beyond, flow has drifted too far
 #: Both ends of a bridge meet when they end this near, in sides of the box.
@@ -99,6 +101,8 @@ class FlowRecorder:
                 hand.track: (before, self._between(grey, old, hand) if self._bridging else None)
                 for hand in hands
             }
+        else:
+            self._bridging = _LONGEST_BRIDGE + 1  # where a hand comes into view it may be misread, too
         self._last = index, grey, hands
         self._motion = motion
 
@@ -134,22 +138,33 @@ def bridge(
     hands: Mapping[int, HandLandmarks], flow: FlowRecorder
 ) -> tuple[dict[int, HandLandmarks], set[int]]:
     """``hands`` by frame, in order, with short runs between breaks carried over from their neighbours; and
-    the frames of short runs that a break parts from the rest at one end, while at the other there is nothing
-    to meet: where the hand comes or goes. Those are not to be trusted."""
+    the frames of short runs that a clear break parts from the rest at one end, while at the other there is
+    nothing to meet: where the hand comes or goes. Those are not to be trusted."""
     result = dict(hands)
     loose: set[int] = set()
     for runs in _stretches(hands, flow):
         anchors = [place for place, run in enumerate(runs) if len(run) >= _ANCHOR]
+        parting = _parting(hands, runs, flow)
         if not anchors:
+            frames = {index for run in runs for index in run}
+            if len(frames) < _ANCHOR and max(parting, default=0.0) > _MISREAD:
+                loose |= frames
             continue
         for one, two in pairwise(anchors):
             between = [index for run in runs[one + 1 : two] for index in run]
             if between and len(between) <= _LONGEST_BRIDGE:
                 result |= _bridged(hands, [runs[one][-1], *between, runs[two][0]], flow)
-        for ends in (runs[: anchors[0]], runs[anchors[-1] + 1 :]):
+        early = [place for place in range(anchors[0]) if parting[place] > _MISREAD]
+        late = [place for place in range(anchors[-1], len(parting)) if parting[place] > _MISREAD]
+        for ends in (runs[: early[-1] + 1] if early else [], runs[late[0] + 1 :] if late else []):
             frames = {index for run in ends for index in run}
             loose |= frames if len(frames) <= _LONGEST_BRIDGE else set()
     return result, loose
+
+
+def _parting(hands: Mapping[int, HandLandmarks], runs: list[list[int]], flow: FlowRecorder) -> list[float]:
+    """How far each run begins from where the picture carries the end of the one before."""
+    return [_off(hands[one[-1]], hands[two[0]], flow) for one, two in pairwise(runs)]
 
 
 def _size(hand: HandLandmarks) -> float:
@@ -181,12 +196,17 @@ def _step(one: HandLandmarks, two: HandLandmarks, flow: FlowRecorder) -> Step | 
 
 
 def _is_break(one: HandLandmarks, two: HandLandmarks, flow: FlowRecorder) -> bool:
-    """Whether ``two`` is not where the picture carries ``one``; there is a step between them."""
+    """Whether ``two`` is not where the picture carries ``one``."""
+    return _off(one, two, flow) > _BREAK
+
+
+def _off(one: HandLandmarks, two: HandLandmarks, flow: FlowRecorder) -> float:
+    """How far ``two`` is from where the picture carries ``one``, in sides of the box; 0 without flow."""
     step = _step(one, two, flow)
     if step is None or (step[1] is None and one.track == two.track):
-        return False
+        return 0.0
     expected = one.points if step[1] is None else step[1].carry(one.points)
-    return _worst(two.points - expected) > _BREAK * _size(one)
+    return _worst(two.points - expected) / _size(one)
 
 
 def _bridged(

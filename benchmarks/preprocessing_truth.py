@@ -242,7 +242,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         meter = ProgressMeter(lambda *_: None)
         clip = prepare(folder / "video.mp4", FitOptions(holdout=0), meter, lambda *_: None)
         each = 1e3 * (time.perf_counter() - started) / clip.frames_read
-        print(f"{folder.name}: {clip.tracked} of {clip.frames_read} frames tracked, {each:.0f} ms a frame")
+        trusted = f"{clip.tracked - len(clip.doubted)} trusted"
+        print(f"{folder.name}: {clip.tracked} of {clip.frames_read} frames tracked, {trusted}", end=", ")
+        print(f"{each:.0f} ms a frame")
         print(f"  mask IoU {mask_iou(clip, truth):.3f}")
         mean = Shape.mean(clip.model, clip.start.betas[0])
         print(f"  aligned: {measure(mean, clip.start, clip, truth)}")

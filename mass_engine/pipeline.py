@@ -159,6 +159,7 @@ def _fit_hand(
         },
         frames={
             "tracked": clip.tracked,
+            "not_trusted": clip.doubted,
             "fitted": [view.index for view in clip.views if not view.heldout],
             "heldout": [view.index for view in clip.views if view.heldout],
             "choice": clip.choice.summary(),

@@ -24,6 +24,7 @@ from mass_engine.quality import FrameQuality
 from mass_engine.survey import Survey, SurveyedHand, Warn, survey
 from mass_engine.tracking.alignment import align_landmarks, interpolate_pose
 from mass_engine.tracking.contact import hide_other, is_apart
+from mass_engine.tracking.imports.placing import solve_translation
 from mass_engine.tracking.landmarks import HandLandmarks
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE, HandMask, HandSegmenter, hand_box
 from mass_engine.tracking.tracks import Tracks
@@ -40,7 +41,8 @@ HELDOUT_LIMIT = 160
 
 @dataclass(frozen=True)
 class Clip:
-    """``views`` in time order with their ``start`` poses [F]; ``tracked`` counts frames with a hand.
+    """``views`` in time order with their ``start`` poses [F]; ``tracked`` counts frames with the hand, of
+    which those of ``doubted`` are not used.
 
     ``template`` is the name of what ``model`` comes from; ``choice`` says why these frames are fitted;
     ``fov_source`` see :class:`mass_engine.survey.SurveyedHand`.
@@ -55,6 +57,7 @@ class Clip:
     start: HandPose
     frames_read: int
     tracked: int
+    doubted: list[int]
     choice: FrameChoice
 
 
@@ -74,10 +77,11 @@ def prepare_hand(
     views = _cut_views(video, chosen, hand.others, found.times, hand.camera, options, meter)
     imported = hand.imported
     # Shape parameters mean something else on another template: then only the landmarks are of use.
-    if imported is None or imported.template != template.name:
-        start = _align(model, views, chosen, hand.camera, meter)
-    else:
+    if imported is not None and imported.template == template.name:
         start = _rows_of(imported, [view.index for view in views])
+    else:
+        begin = None if imported is None else _begin(imported, model, chosen, hand.camera)
+        start = _align(model, views, chosen, hand.camera, begin, meter)
     return Clip(
         found.info,
         hand.camera,
@@ -87,7 +91,8 @@ def prepare_hand(
         views,
         start,
         len(found.times),
-        len(hand.marks),
+        len(hand.marks) + len(hand.doubted),
+        hand.doubted,
         choice,
     )
 
@@ -203,9 +208,15 @@ def _user_mask(directory: Path, index: int, box: tuple[int, int, int, int], came
 
 
 def _align(
-    model: HandModel, views: list[View], marks: Sequence[HandLandmarks], camera: Camera, meter: ProgressMeter
+    model: HandModel,
+    views: list[View],
+    marks: Sequence[HandLandmarks],
+    camera: Camera,
+    begin: HandPose | None,
+    meter: ProgressMeter,
 ) -> HandPose:
-    """Shape and poses of the training frames first; then held-out poses under that shape."""
+    """Shape and poses of the training frames first; then held-out poses under that shape. ``begin`` [F] where
+    poses are known roughly."""
     train = [row for row, view in enumerate(views) if not view.heldout]
     held = [row for row, view in enumerate(views) if view.heldout]
     main = align_landmarks(
@@ -213,11 +224,16 @@ def _align(
         [marks[row] for row in train],
         [views[row].time for row in train],
         camera,
+        start=None if begin is None else _rows(begin, train),
         progress=lambda fraction: meter.update("align", 0.8 * fraction),
     ).pose
     if not held:
         return main
-    start = interpolate_pose(main, [views[row].time for row in train], [views[row].time for row in held])
+    start = (
+        interpolate_pose(main, [views[row].time for row in train], [views[row].time for row in held])
+        if begin is None
+        else _rows(begin, held)
+    )
     rest = align_landmarks(
         model,
         [marks[row] for row in held],
@@ -235,6 +251,29 @@ def _align(
         torch.cat([main.hand_pose, rest.hand_pose])[order],
         torch.cat([main.transl, rest.transl])[order],
         main.side,
+    )
+
+
+def _begin(
+    tracks: Tracks, model: HandModel, marks: Sequence[HandLandmarks], camera: Camera
+) -> HandPose | None:
+    """The imported rotations on this hand of mean shape, each where its points are; None without them."""
+    if not tracks.rotations:
+        return None
+    known = _rows_of(tracks, [mark.index for mark in marks])
+    pose = replace(known, betas=torch.zeros_like(known.betas), transl=torch.zeros_like(known.transl))
+    points = np.stack([mark.points for mark in marks]).astype(np.float64)
+    local = model.joints(pose).double().numpy()
+    transl = solve_translation(local, points, camera.K.double().numpy())
+    if not np.isfinite(transl).all() or (transl[:, 2] < 0.05).any():
+        return None
+    return replace(pose, transl=torch.tensor(transl, dtype=torch.float32))
+
+
+def _rows(pose: HandPose, rows: Sequence[int]) -> HandPose:
+    index = torch.tensor(rows)
+    return HandPose(
+        pose.betas[index], pose.global_orient[index], pose.hand_pose[index], pose.transl[index], pose.side
     )
 
 

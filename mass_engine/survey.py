@@ -37,8 +37,9 @@ Warn = Callable[[str, str, str], None]
 class SurveyedHand:
     """One hand over the clip: trusted ``marks`` in time order and their ``quality`` by frame.
 
-    ``others`` is the other hand by frame, where one is followed. ``fov_source``: ``given`` by the user, from
-    the file's ``metadata``, known to the imported ``tracks``, or ``assumed``.
+    ``doubted`` frames show it, but are outliers or mixed up with another hand. ``others`` is the other hand
+    by frame, where one is followed. ``fov_source``: ``given`` by the user, from the file's ``metadata``,
+    known to the imported ``tracks``, or ``assumed``.
     """
 
     side: Side
@@ -46,6 +47,7 @@ class SurveyedHand:
     quality: Mapping[int, FrameQuality]
     camera: Camera
     fov_source: str
+    doubted: list[int] = field(default_factory=list)
     others: Mapping[int, HandLandmarks] = field(default_factory=dict)
     imported: Tracks | None = None
 
@@ -127,7 +129,8 @@ def _tracked(
         others = other.hands if other else {}
         mixed = mixed_frames(track.hands, others)
         marks = [mark for i, mark in track.hands.items() if mark.trusted and i not in mixed]
-        judged.append(SurveyedHand(track.side, marks, seen.of(marks), camera, source, others))
+        doubted = [i for i, mark in track.hands.items() if not mark.trusted or i in mixed]
+        judged.append(SurveyedHand(track.side, marks, seen.of(marks), camera, source, doubted, others))
     same_side = {track.side: track.same_side for track, _ in tracks}
     return _judged(judged, same_side, options, warn)
 
@@ -232,8 +235,8 @@ def _imported(
                 seen.of(marks),
                 replace(camera, K=one.tracks.K) if known else camera,
                 "tracks" if known else source,
-                given[1 - number] if len(given) == 2 else {},
-                one.tracks,
+                others=given[1 - number] if len(given) == 2 else {},
+                imported=one.tracks,
             )
         )
     return _judged(found, {}, options, warn)

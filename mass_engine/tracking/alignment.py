@@ -40,7 +40,7 @@ class AlignmentWeights:
     direction: float = 0.02  # world landmarks: bone directions
     direction_lead: float = 0.5  # more of it at the start, gone by half time
     limits: float = 1.0
-    rest: float = 2e-4  # pull of every finger angle towards the flat hand
+    rest: float = 2e-4  # pull of every finger angle towards the flat hand, or to the given start
     shape: float = 2e-4  # pull of every shape parameter towards the mean hand
     smooth: float = 0.3  # acceleration of the joints, hand sizes per (1/30 s)^2
     robust_scale: float = 0.03  # Charbonnier scale, in hand sizes
@@ -129,6 +129,7 @@ def align_landmarks(
 
     free_betas = torch.zeros(10) if betas is None else betas.clone()
     orient, fingers = begin.global_orient.clone(), begin.hand_pose.clone()
+    usual = begin.hand_pose  # flat, or as given
     depth0 = begin.transl[:, 2:].clamp_min(0.05)
     shift = torch.zeros_like(begin.transl)
     groups = [
@@ -171,7 +172,7 @@ def align_landmarks(
         loss = w.reprojection * (robust.mean(-1) * trust).mean()
         loss = loss + (w.direction + w.direction_lead * lead) * (cue.mean(-1) * trust).mean()
         loss = loss + w.limits * limit_excess(fingers, limits, frames).square().sum((-1, -2)).mean()
-        loss = loss + w.rest * fingers.square().sum(-1).mean() + w.shape * free_betas.square().sum()
+        loss = loss + w.rest * (fingers - usual).square().sum(-1).mean() + w.shape * free_betas.square().sum()
         behind = (0.05 - joints[..., 2]).clamp_min(0)
         loss = loss + 100 * behind.square().sum(-1).mean()
         if len(landmarks) > 2 and w.smooth > 0:

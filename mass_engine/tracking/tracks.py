@@ -27,7 +27,8 @@ class Tracks:
     metres, ``landmarks2d`` [F,21,2] pixels, ``scores`` [F]; ``K`` [3,3] for pictures of ``size`` (w, h).
 
     ``template`` names the hand that the poses, and above all ``betas``, are of. ``at_joints``: the
-    ``landmarks2d`` are joints of a hand model, not what a tracker saw in the picture.
+    ``landmarks2d`` are joints of a hand model, not what a tracker saw in the picture. ``rotations``: those
+    of ``pose`` are about a flat hand's, so that an alignment of any template can begin with them.
     """
 
     video: str
@@ -42,6 +43,7 @@ class Tracks:
     scores: list[float]
     template: str = "builtin"
     at_joints: bool = False
+    rotations: bool = True
 
 
 def write_tracks(tracks: Sequence[Tracks], path: Path) -> None:

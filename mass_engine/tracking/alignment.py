@@ -7,7 +7,8 @@ directions, a weak depth cue.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -98,6 +99,18 @@ def initial_pose(model: HandModel, landmarks: Sequence[HandLandmarks], camera: C
     )
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Tensors of a few thousand numbers: a second thread only waits, on a busy machine for long."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@_one_thread()
 def align_landmarks(
     model: HandModel,
     landmarks: Sequence[HandLandmarks],

@@ -77,6 +77,7 @@ class FlowRecorder:
         self._last: tuple[int, NDArray[np.uint8], list[HandLandmarks]] | None = None
         self._motion: dict[int, NDArray[np.float32]] = {}
         self._bridging = 0
+        self._unbroken: list[int] = []  # frames since the last break that steps lead to
 
     def add(self, rgb: NDArray[np.uint8], index: int, hands: list[HandLandmarks]) -> None:
         """The next frame uint8 [H,W,3] and the hands in it."""
@@ -95,16 +96,36 @@ class FlowRecorder:
                     steps[hand.track] = index, None
                     continue
                 steps[hand.track] = index, self._between(old, grey, hand)
-                if two is not None and _is_break(hand, two, self):
+                if two is None:
+                    continue
+                if _is_break(hand, two, self):
                     self._bridging = _LONGEST_BRIDGE + 1
+                    self._unbroken = []
+                elif not self._bridging:
+                    steps[hand.track] = index, None
             self.back[index] = {
                 hand.track: (before, self._between(grey, old, hand) if self._bridging else None)
                 for hand in hands
             }
+            if self._bridging:
+                self._unbroken.append(index)
+            else:
+                self._forget()
         else:
-            self._bridging = _LONGEST_BRIDGE + 1  # where a hand comes into view it may be misread, too
+            # Where a hand comes into view it may be misread, too.
+            self._bridging = _LONGEST_BRIDGE + 1
+            self._unbroken = []
         self._last = index, grey, hands
         self._motion = motion
+
+    def _forget(self) -> None:
+        """Drop the flow of a long run without a break: no bridge will lead over it."""
+        for index in self._unbroken[1:]:
+            steps = self.back[index]
+            self.back[index] = {track: (before, None) for track, (before, _) in steps.items()}
+            for before in {before for before, _ in steps.values()}:
+                self.ahead[before] = {track: (to, None) for track, (to, _) in self.ahead[before].items()}
+        self._unbroken = []
 
     def _moves_on(self, one: HandLandmarks, two: HandLandmarks) -> bool:
         """Whether a hand stays, or goes on as it went before: then there is no break."""

@@ -9,10 +9,13 @@ import pytest
 
 from mass_engine.errors import EngineError
 from mass_engine.hand.pose import Side
+from mass_engine.tracking.contact import mixed_frames
 from mass_engine.tracking.landmarks import HandLandmarks
+from mass_engine.tracking.models import HandNetworks
 from mass_engine.tracking.sides import label_sides
-from mass_engine.tracking.track import both_hands
-from tests.engine.tracking.clips import landmarks, open_hand
+from mass_engine.tracking.track import TrackBuilder, both_hands
+from mass_engine.tracking.tracker import TrackerOptions
+from tests.engine.tracking.clips import frames, landmarks, needs_truth, open_hand, truth_mask, truth_points
 
 COUNT = 60
 
@@ -92,3 +95,35 @@ def test_a_hand_that_is_not_there_is_left_out_and_none_at_all_is_refused() -> No
     with pytest.raises(EngineError) as caught:
         both_hands({}, [i / 30 for i in range(COUNT)], (), 640, 480)
     assert caught.value.code == "video.no_hand"
+
+
+@needs_truth
+def test_real_looking_hands_that_cross_keep_their_sides() -> None:
+    """A rendered right hand passes over its mirror image, which is hidden for a second."""
+    clip, right = frames("dev_a"), truth_points("dev_a")
+    width = clip[0].rgb.shape[1]
+    builder = TrackBuilder(HandNetworks.load(), TrackerOptions(look_every=4))
+    shifts = [int(420 - 840 * i / (len(clip) - 1)) for i in range(len(clip))]
+    for frame, shift in zip(clip, shifts, strict=True):
+        picture = np.full((frame.rgb.shape[0], 2 * width, 3), 150, np.uint8)
+        picture[:, width // 2 : width // 2 + width] = frame.rgb[:, ::-1]
+        rows, columns = np.nonzero(truth_mask("dev_a", frame.index))
+        moved = columns + width // 2 + shift
+        seen = (moved >= 0) & (moved < 2 * width)
+        picture[rows[seen], moved[seen]] = frame.rgb[rows[seen], columns[seen]]
+        builder.add(replace(frame, rgb=picture))
+    tracks = builder.finish_both()
+    assert set(tracks) == {"right", "left"}
+    for side, other in (("right", "left"), ("left", "right")):
+        hands, others = tracks[side], tracks[other].hands  # type: ignore[index]
+        sure = set(hands.trusted) - mixed_frames(hands.hands, others)
+        assert len(sure) > 30
+        for i in sure:
+            places = {
+                "right": right[i] + [width / 2 + shifts[i], 0],
+                "left": right[i] * [-1, 1] + [1.5 * width, 0],
+            }
+            off = {
+                name: np.linalg.norm(hands.hands[i].points - p, axis=1).mean() for name, p in places.items()
+            }
+            assert off[side] < off[other], i

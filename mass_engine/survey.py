@@ -96,7 +96,7 @@ def survey(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) -
 def survey_camera(info: VideoInfo, options: FitOptions) -> tuple[Camera, str]:
     """The camera of the clip, and where its field of view is from: ``given``, ``metadata`` or ``assumed``.
 
-    It is not estimated from the hand: the best fit of the landmarks names a field of view that is 8 to 20
+    It is not estimated from the hand: the best fit of the landmarks names a field of view that is 8 to 25
     degrees off and moves the joints by less than their error (see BENCHMARKS.md).
     """
     if options.fov is not None:

@@ -124,7 +124,7 @@ def measure(shape: Shape, pose: HandPose, clip: Clip, truth: TruthClip) -> Error
     pose = replace(pose, betas=shape.betas.expand_as(pose.betas))
     binding = MeshBinding.build(model, 1, 1)
     with torch.no_grad():
-        posed = model.posed(pose, shape.offsets())
+        posed = model.posed(pose, shape.displacement)
         refined = fine.apply(posed.vertices).double().numpy()
         joints = posed.joints
         projected = clip.camera.project(joints).numpy()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 
@@ -17,27 +18,27 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.channels import Channel, ChannelImage, extract, parse_channel, raster_options
+from mass_engine.deform.posing import CompiledSurfels, MeshPose, PosableSurfels, ShadedSurfels
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.fitting.subject import (
     Appearance,
     PosedSurfels,
     Shape,
     pose_surfels,
-    render_row,
     surfel_colors,
-    vertex_normals,
 )
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose, Side
 from mass_engine.hand.poses import POSE_NAMES, parse_pose
-from mass_engine.raster import RasterOptions, RenderOutput
+from mass_engine.raster import RasterOptions, RenderOutput, rasterize
 from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
 from mass_engine.surfel.cloud import SurfelCloud
 from mass_engine.surfel.harmonics import rgb_to_sh0
+from mass_engine.threads import one_thread
 from mass_engine.viewpoint import parse_camera
 
 FILE_NAME = "avatar.safetensors"
-_FORMAT = "1"
+_FORMAT = "2"
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,10 @@ def row_pose(pose: HandPose, row: int) -> HandPose:
 
 @dataclass
 class Avatar:
-    """A posable hand of surfels. ``kept`` [M] are the surfels of ``binding`` that the fit kept."""
+    """A posable hand of surfels. ``kept`` [M] are the surfels of ``binding`` that the fit kept.
+
+    Finished: once rendered, changes of its tensors no longer reach the picture.
+    """
 
     shape: Shape
     binding: MeshBinding
@@ -95,19 +99,29 @@ class Avatar:
         self, pose: HandPose, camera: Camera, options: RasterOptions | None = None
     ) -> RenderOutput:
         """Rasterise one pose (a batch of one) over black."""
-        return self._rasterize(self.posed(pose), camera, options or RasterOptions(cull_backfaces=True))
+        options = options or RasterOptions(cull_backfaces=True)
+        return _rasterize(self._shaded(pose, camera), camera, options)
 
     def image(self, pose: HandPose, camera: Camera, channel: Channel = "rgb") -> ChannelImage:
         """One channel of one pose (a batch of one)."""
-        surfels = self.posed(pose)
-        means = surfels.row(0).means
-        out = self._rasterize(surfels, camera, raster_options(channel, means, camera))
-        return extract(channel, out, means, camera)
+        surfels = self._shaded(pose, camera)
+        out = _rasterize(surfels, camera, raster_options(channel, surfels.means, camera))
+        return extract(channel, out, surfels.means, camera)
 
-    def _rasterize(self, surfels: PosedSurfels, camera: Camera, options: RasterOptions) -> RenderOutput:
-        bones = self.binding.bones[self.kept]
-        with torch.no_grad():
-            return render_row(self.appearance, surfels, 0, bones, camera, options)
+    @cached_property
+    def _compiled(self) -> CompiledSurfels:
+        look = self.appearance
+        opacities = torch.sigmoid(look.opacity_logits)
+        return PosableSurfels(self.binding, self.kept, look.albedo, opacities, look.sh, look.light).compiled()
+
+    def _shaded(self, pose: HandPose, camera: Camera) -> ShadedSurfels:
+        """The kept surfels in one pose (a batch of one) as ``camera`` sees them."""
+        with torch.no_grad(), one_thread():
+            hand = self.shape.model.posed(pose, self.shape.offsets())
+            refined = self.binding.subdivision.apply(hand.vertices)[0]
+            center = -camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3]
+            bones = hand.bone_transforms[0, :, :3, :3]
+            return self._compiled.posed(MeshPose(refined, bones, center, pose.hand_pose[0], pose.betas[0]))
 
     def resolve_pose(self, spec: str) -> HandPose:
         """``frame:N``, a named pose or 48 numbers -> a placed pose with this hand's shape (batch of one).
@@ -143,7 +157,7 @@ class Avatar:
     def _bounds(self, pose: HandPose) -> tuple[Tensor, float]:
         """Centre [3] and radius of a sphere around the posed hand."""
         with torch.no_grad():
-            vertices = self.shape.model.posed(pose, self.shape.offsets()).vertices[0]
+            vertices = self.shape.model.posed(pose, self.shape.displacement).vertices[0]
         center = (vertices.amax(0) + vertices.amin(0)) / 2
         return center, float((vertices - center).norm(dim=-1).max())
 
@@ -272,6 +286,13 @@ class Avatar:
             ) from error
 
 
+def _rasterize(surfels: ShadedSurfels, camera: Camera, options: RasterOptions) -> RenderOutput:
+    with torch.no_grad():
+        return rasterize(
+            surfels.means, surfels.tangents, surfels.opacities, surfels.colors, camera, options=options
+        )
+
+
 def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Avatar:
     if metadata["format"] != _FORMAT:
         raise ValueError(f"format {metadata['format']!r}, not {_FORMAT!r}")
@@ -286,7 +307,6 @@ def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Avatar:
         model,
         tensors["shape.betas"],
         tensors["shape.displacement"],
-        vertex_normals(model.template, model.faces),
     )
     width, height = json.loads(metadata["size"])
     pose = HandPose(

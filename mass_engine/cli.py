@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 
 from mass_engine.errors import BadArgumentError, EngineError
-from mass_engine.options import DEVICES, PRESETS, SIDES, FitOptions
+from mass_engine.options import DEVICES, PRESETS, SEGMENTERS, SIDES, FitOptions
 from mass_engine.progress import Progress
 
 Command = Callable[[argparse.Namespace], None]
@@ -55,6 +55,10 @@ def build_parser() -> argparse.ArgumentParser:
         default="auto",
         help="which hand; both: a person's two hands, as RUN/right and RUN/left",
     )
+    fit.add_argument(
+        "--segmenter", choices=SEGMENTERS, default="colors", help="how masks are made; sam-hq is an extra"
+    )
+    fit.add_argument("--segmenter-weights", type=Path, metavar="FILE", help="your SAM-HQ checkpoint")
     fit.add_argument("--preset", choices=PRESETS, default="auto")
     fit.add_argument(
         "--holdout", type=int, default=0, metavar="N", help="keep every N-th frame out of the fit"
@@ -151,6 +155,8 @@ def _fit(arguments: argparse.Namespace) -> None:
         template=arguments.template,
         tracks=arguments.tracks,
         masks=arguments.masks,
+        segmenter=arguments.segmenter,
+        segmenter_weights=arguments.segmenter_weights,
         side=arguments.side,
         preset=arguments.preset,
         holdout=arguments.holdout,

@@ -12,6 +12,7 @@ from mass_engine.tracks_spec import parse_tracks
 PRESETS = ("draft", "auto", "full")
 SIDES = ("auto", "left", "right", "both")
 DEVICES = ("auto", "cpu", "cuda")
+SEGMENTERS = ("colors", "sam-hq")
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,9 @@ class FitOptions:
     ``side`` of the hand to fit: ``auto`` the most prominent one, ``both`` a person's two hands, each of them
     an avatar of its own (``masks`` then has a folder ``right`` and a folder ``left``).
 
+    ``masks`` is a folder of masks to use instead of made ones; ``segmenter`` says how masks are made, and
+    ``segmenter_weights`` is the checkpoint that "sam-hq" needs.
+
     ``holdout`` N keeps the frames N-1, 2N-1, ... out of the fit (0: none). ``fov`` in degrees spans the
     longer image side; None takes what the file says or a phone-like default; the report says which.
     ``max_frames`` bounds the frames the fit sees; held-out frames do not count, of which at most 160 (or
@@ -32,6 +36,8 @@ class FitOptions:
     template: str = "builtin"
     tracks: Path | str | None = None
     masks: Path | None = None
+    segmenter: str = "colors"
+    segmenter_weights: Path | None = None
     side: str = "auto"
     preset: str = "auto"
     holdout: int = 0
@@ -45,6 +51,18 @@ class FitOptions:
             (self.preset in PRESETS, "preset", self.preset, f"Use one of {', '.join(PRESETS)}."),
             (self.side in SIDES, "side", self.side, f"Use one of {', '.join(SIDES)}."),
             (self.device in DEVICES, "device", self.device, f"Use one of {', '.join(DEVICES)}."),
+            (
+                self.segmenter in SEGMENTERS,
+                "segmenter",
+                self.segmenter,
+                f"Use one of {', '.join(SEGMENTERS)}.",
+            ),
+            (
+                (self.segmenter == "sam-hq") == (self.segmenter_weights is not None),
+                "segmenter_weights",
+                self.segmenter_weights,
+                "Give a checkpoint with --segmenter sam-hq, and only with it.",
+            ),
             (self.holdout == 0 or self.holdout >= 2, "holdout", self.holdout, "Use 0, or 2 and more."),
             (self.fov is None or 5 <= self.fov <= 150, "fov", self.fov, "Use 5 to 150 degrees."),
             (2 <= self.max_frames <= 10_000, "max_frames", self.max_frames, "Use 2 to 10000."),

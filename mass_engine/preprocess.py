@@ -26,6 +26,7 @@ from mass_engine.tracking.alignment import align_landmarks, interpolate_pose
 from mass_engine.tracking.contact import hide_other, is_apart
 from mass_engine.tracking.imports.placing import solve_translation
 from mass_engine.tracking.landmarks import HandLandmarks
+from mass_engine.tracking.sam_hq import Predictor, SamHqSegmenter
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE, HandMask, HandSegmenter, hand_box
 from mass_engine.tracking.tracks import Tracks
 from mass_engine.video.ahead import ahead
@@ -74,7 +75,7 @@ def prepare_hand(
     template = found.template
     model = template.model(hand.side)
     chosen, choice = _choose(hand.marks, hand.quality, found.times, options)
-    views = _cut_views(video, chosen, hand.others, found.times, hand.camera, options, meter)
+    views = _cut_views(video, chosen, hand.others, found.times, hand.camera, options, found.network, meter)
     imported = hand.imported
     # Shape parameters mean something else on another template: then only the landmarks are of use.
     if imported is not None and imported.template == template.name:
@@ -121,6 +122,7 @@ def _cut_views(
     times: Mapping[int, float],
     camera: Camera,
     options: FitOptions,
+    network: Predictor | None,
     meter: ProgressMeter,
 ) -> list[View]:
     """Second pass over the video: crops around the hand, then their masks, without the other hand."""
@@ -142,7 +144,10 @@ def _cut_views(
         alone = [row for row in train if is_apart(crops[row][0], others.get(crops[row][0].index))]
         train = alone if len(alone) >= 4 else train
         picked = np.unique(np.linspace(0, len(train) - 1, min(MASK_SAMPLES, len(train))).round().astype(int))
+        segmenter: HandSegmenter | SamHqSegmenter
         segmenter = HandSegmenter.train([(crops[train[i]][2], moved[train[i]]) for i in picked])
+        if network is not None:
+            segmenter = SamHqSegmenter(segmenter, network)
         with ThreadPoolExecutor(2) as pool:
             masks = []
             for done, mask in enumerate(
@@ -154,13 +159,14 @@ def _cut_views(
         folder = options.masks / marks[0].side if options.side == "both" else options.masks
         masks = [_user_mask(folder, mark.index, box, camera) for mark, box, _ in crops]
         others = {}
-    return [
-        _view(
-            mark, times[mark.index], options.is_heldout(mark.index), box, rgb,
-            hide_other(mask.full(*rgb.shape[:2]), mark, others.get(mark.index), box[:2]), camera,
-        )
-        for (mark, box, rgb), mask in zip(crops, masks, strict=True)
-    ]  # fmt: skip
+    views = []
+    for (mark, box, rgb), mask in zip(crops, masks, strict=True):
+        size = rgb.shape[0], rgb.shape[1]
+        labels = hide_other(mask.full(*size), mark, others.get(mark.index), box[:2])
+        coverage = np.where(labels == IGNORE, np.float32(0), mask.full_coverage(*size))
+        heldout = options.is_heldout(mark.index)
+        views.append(_view(mark, times[mark.index], heldout, box, rgb, labels, coverage, camera))
+    return views
 
 
 def _view(
@@ -170,6 +176,7 @@ def _view(
     box: tuple[int, int, int, int],
     rgb: NDArray[np.uint8],
     labels: NDArray[np.uint8],
+    coverage: NDArray[np.float32],
     camera: Camera,
 ) -> View:
     height, width = rgb.shape[:2]
@@ -179,8 +186,24 @@ def _view(
         size = max(1, round(width * scale)), max(1, round(height * scale))
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
         labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        coverage = np.asarray(cv2.resize(coverage, size, interpolation=cv2.INTER_AREA), np.float32)
+        # Where the reduced coverage decides, so do the labels.
+        labels = np.where(labels == IGNORE, IGNORE, np.where(coverage > 0.5, HAND, BACKGROUND)).astype(
+            np.uint8
+        )
         view_camera = view_camera.resized(*size)
-    return View(mark.index, time, heldout, rgb, labels, view_camera, mark.points, mark.score, mark.at_joints)
+    return View(
+        mark.index,
+        time,
+        heldout,
+        rgb,
+        labels,
+        view_camera,
+        mark.points,
+        mark.score,
+        mark.at_joints,
+        coverage,
+    )
 
 
 def _user_mask(directory: Path, index: int, box: tuple[int, int, int, int], camera: Camera) -> HandMask:
@@ -204,7 +227,7 @@ def _user_mask(directory: Path, index: int, box: tuple[int, int, int, int], came
     labels = np.full(part.shape, IGNORE, np.uint8)
     labels[part == 0] = BACKGROUND
     labels[part == 255] = HAND
-    return HandMask((0, 0, w, h), labels)
+    return HandMask((0, 0, w, h), labels, (labels == HAND).astype(np.float32))
 
 
 def _align(

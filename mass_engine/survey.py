@@ -19,6 +19,7 @@ from mass_engine.tracking.contact import mixed_frames
 from mass_engine.tracking.imports.load import LoadedTracks, load_tracks
 from mass_engine.tracking.landmarks import HandLandmarks
 from mass_engine.tracking.models import HandNetworks
+from mass_engine.tracking.sam_hq import Predictor, load_predictor
 from mass_engine.tracking.sides import SIDES
 from mass_engine.tracking.track import Track, TrackBuilder
 from mass_engine.tracking.tracker import TrackerOptions
@@ -54,17 +55,22 @@ class SurveyedHand:
 
 @dataclass(frozen=True)
 class Survey:
-    """``hands`` to fit (two only when both were asked for); ``times`` in seconds of every frame read."""
+    """``hands`` to fit (two only when both were asked for); ``times`` in seconds of every frame read;
+    ``network`` that refines the masks of all hands, where one was asked for."""
 
     info: VideoInfo
     template: Template
     times: Mapping[int, float]
     hands: list[SurveyedHand]
+    network: Predictor | None = None
 
 
 def survey(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) -> Survey:
     """Read, track and judge. Raises EngineError when the video cannot be used."""
     meter.update("read", 0.0)
+    # A wrong checkpoint is told before the long work.
+    wanted = None if options.masks is not None else options.segmenter_weights
+    network = None if wanted is None else load_predictor(wanted)
     template = load_template(parse_template(options.template))
     for code, message in template.notes:
         warn(code, message, "Look at the result with care.")
@@ -90,7 +96,7 @@ def survey(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) -
     else:
         loaded = _loaded(template, info, options, camera, warn)
         found = _imported(frames(), times, loaded, seen, camera, source, options, warn)
-    return Survey(info, template, times, found)
+    return Survey(info, template, times, found, network)
 
 
 def survey_camera(info: VideoInfo, options: FitOptions) -> tuple[Camera, str]:

@@ -26,8 +26,8 @@ version=$("$PYTHON" -c 'import sys; print(f"{sys.version_info.major}.{sys.versio
 
 # The stamp covers what the set-up reads: unchanged inputs make the next run a no-op.
 stamp=$VENV/.set-up-$(cat pyproject.toml constraints.txt CMakeLists.txt scripts/setup.sh \
-    mass_engine/tracking/models.py mass_engine/raster/kernels/* | sha256sum | cut -c1-16)
-if [ -e "$stamp" ] && [ -x "$VENV/bin/mass-engine" ] && "$VENV/bin/python" -c 'import mass_engine.raster._kernels' 2>/dev/null; then
+    mass_engine/tracking/models.py mass_engine/raster/kernels/* mass_engine/deform/kernels/* | sha256sum | cut -c1-16)
+if [ -e "$stamp" ] && [ -x "$VENV/bin/mass-engine" ] && "$VENV/bin/python" -c 'import mass_engine.raster._kernels, mass_engine.deform._kernels' 2>/dev/null; then
     "$VENV/bin/python" -m mass_engine.tracking.models >/dev/null && exit 0
 fi
 

@@ -62,7 +62,12 @@ def hand_scene(count: int, pose_name: str = "point", seed: int = 0) -> Scene:
 
 def hand_camera(scene: Scene, width: int, height: int) -> Camera:
     """Half a metre in front of the hand, which fills nine tenths of the picture."""
-    low, high = scene.means.amin(0), scene.means.amax(0)
+    return framing_camera(scene.means, width, height)
+
+
+def framing_camera(points: Tensor, width: int, height: int) -> Camera:
+    """Half a metre in front of ``points`` [N,3], which fill nine tenths of the picture one way."""
+    low, high = points.amin(0), points.amax(0)
     center, size = (low + high) / 2, high - low
     distance = 0.5
     focal = 0.9 * distance * min(width / float(size[0]), height / float(size[1]))

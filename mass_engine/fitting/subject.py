@@ -35,22 +35,16 @@ def mesh_edges(faces: Tensor) -> Tensor:
 
 @dataclass
 class Shape:
-    """``betas`` [10] and a displacement [V] in metres along the rest normals (the personal surface)."""
+    """``betas`` [10] and a displacement [V,3] in metres of the rest vertices (the personal surface)."""
 
     model: HandModel
     betas: Tensor
     displacement: Tensor
-    normals: Tensor
 
     @staticmethod
     def mean(model: HandModel, betas: Tensor) -> Shape:
         """No displacement yet."""
-        normals = vertex_normals(model.template, model.faces)
-        return Shape(model, betas.clone(), torch.zeros(len(model.template)), normals)
-
-    def offsets(self) -> Tensor:
-        """Canonical vertex offsets [V,3]."""
-        return self.normals * self.displacement.unsqueeze(-1)
+        return Shape(model, betas.clone(), torch.zeros_like(model.template))
 
 
 @dataclass
@@ -85,7 +79,7 @@ class PosedSurfels:
 
 def pose_surfels(shape: Shape, binding: MeshBinding, pose: HandPose) -> PosedSurfels:
     """Pose the hand and register a surfel in every small triangle; ``pose`` is batched [B]."""
-    posed = shape.model.posed(pose, shape.offsets())
+    posed = shape.model.posed(pose, shape.displacement)
     refined = binding.subdivision.apply(posed.vertices)
     return PosedSurfels(binding.register(refined), refined, posed.bone_transforms[..., :3, :3], posed.joints)
 

@@ -211,7 +211,7 @@ def _keep(evidence: Evidence, binding: MeshBinding, model: HandModel) -> Tensor:
     along = along if model.side == "right" else -along  # the forearm's axis, outward
     wrist = along > -WRIST_REACH
     hand = evidence.hand[wrist]
-    other = FOREARM_WEIGHT * (evidence.ignored + evidence.background)[wrist]
+    other = (FOREARM_WEIGHT * (0.02 * evidence.ignored + evidence.background))[wrist]
     if float(other.sum()) < 0.01 * float(hand.sum()):
         return torch.arange(binding.count)
     centered = (places[wrist] - places[wrist].mean(0)) / (2 * WRIST_REACH)

@@ -54,7 +54,8 @@ class Outline:
 
 @dataclass
 class View:
-    """The crop of one frame. ``labels`` holds HandMask codes; ``camera`` is the crop's own."""
+    """The crop of one frame. ``labels`` holds HandMask codes; ``coverage`` [h,w] the hand's share of each
+    pixel in 0..1 (None: as the labels say); ``camera`` is the crop's own."""
 
     index: int
     time: float
@@ -65,6 +66,7 @@ class View:
     points: NDArray[np.float32]  # [21,2] pixels of the whole picture
     score: float
     at_joints: bool = False  # the points are a model's joints, not the tracker's
+    coverage: NDArray[np.float32] | None = None
     _levels: dict[int, Level] = field(default_factory=dict, repr=False)
     _outline: Outline | None = field(default=None, repr=False)
 
@@ -84,7 +86,7 @@ class View:
         height, width = self.labels.shape
         scale = min(1.0, side / max(height, width))
         w, h = max(1, round(width * scale)), max(1, round(height * scale))
-        hand = (self.labels == HAND).astype(np.float32)
+        hand = (self.labels == HAND).astype(np.float32) if self.coverage is None else self.coverage
         ignore = (self.labels == IGNORE).astype(np.float32)
         # Colours next to a sleeve are mixed with it.
         near = cv2.dilate(ignore, np.ones((SEAM, SEAM), np.uint8))

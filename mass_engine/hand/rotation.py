@@ -28,3 +28,34 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     xx, yy, zz = bx * x, by * y, b * z * z
     rows = (1 - yy - zz, xy - az, xz + ay, xy + az, 1 - xx - zz, yz - ax, xz - ay, yz + ax, 1 - xx - yy)
     return torch.stack(rows, -1).reshape(*axis_angle.shape[:-1], 3, 3)
+
+
+def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
+    """Rotation matrices [...,3,3] to axis-angle [...,3], angles in [0, pi]; not meant to be differentiated.
+
+    The quaternion's largest component is taken from the diagonal first, which is exact near pi as well.
+    """
+    m = matrix.double()
+    d = m.diagonal(dim1=-2, dim2=-1)
+    trace = d.sum(-1)
+    squares = torch.stack(
+        [1 + trace, 1 + 2 * d[..., 0] - trace, 1 + 2 * d[..., 1] - trace, 1 + 2 * d[..., 2] - trace], -1
+    )
+    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    rows = torch.stack(
+        [
+            torch.stack([squares[..., 0], a, b, c], -1),
+            torch.stack([a, squares[..., 1], xy, xz], -1),
+            torch.stack([b, xy, squares[..., 2], yz], -1),
+            torch.stack([c, xz, yz, squares[..., 3]], -1),
+        ],
+        -2,
+    )
+    best = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    quaternion = torch.nn.functional.normalize(rows.gather(-2, best).squeeze(-2), dim=-1)
+    quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    sine = quaternion[..., 1:].norm(dim=-1)
+    angle = 2 * torch.atan2(sine, quaternion[..., 0])
+    scale = torch.where(sine > 1e-9, angle / sine.clamp_min(1e-9), torch.full_like(sine, 2.0))
+    return (quaternion[..., 1:] * scale.unsqueeze(-1)).to(matrix)

@@ -81,6 +81,11 @@ class MeshBinding:
         """Number of surfels."""
         return len(self.surfel_faces)
 
+    @property
+    def places(self) -> Tensor:
+        """[K,3,3]: mean and tangents of a face's K small triangles, as combinations of its corners."""
+        return self._parts[::3, ::3].T.reshape(self.per_face, 3, 3)
+
     def surfels(self, vertices: Tensor) -> AttachedSurfels:
         """Attached surfels of posed base-mesh vertices [...,V,3]; differentiable."""
         return self.register(self.subdivision.apply(vertices))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +9,8 @@ import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from mass_engine.surfel.fixed_product import fixed_product, to_torch_csr
 
 
 @dataclass(frozen=True)
@@ -29,21 +30,8 @@ class Subdivision:
         lead, (count, channels) = vertices.shape[:-2], vertices.shape[-2:]
         # One product for the whole batch: columns are (batch, channel).
         columns = vertices.reshape(-1, count, channels).movedim(1, 0).reshape(count, -1)
-        product: Tensor = _FixedProduct.apply(columns, self._matrix, self._transpose)  # type: ignore[no-untyped-call]
+        product = fixed_product(self._matrix, self._transpose, columns)
         return product.reshape(self.n_vertices, -1, channels).movedim(0, 1).reshape(*lead, -1, channels)
-
-
-class _FixedProduct(torch.autograd.Function):
-    """A constant sparse matrix times a dense one; the gradient is the kept transpose times the gradient."""
-
-    @staticmethod
-    def forward(ctx, dense: Tensor, matrix: Tensor, transpose: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
-        ctx.transpose = transpose
-        return torch.mm(matrix, dense)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[no-untyped-def]
-        return torch.mm(ctx.transpose, gradient), None, None
 
 
 def loop_subdivision(faces: Tensor, n_vertices: int, levels: int) -> Subdivision:
@@ -117,17 +105,3 @@ def _loop_step(
         [np.stack(corners, 1) for corners in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))], 1
     )
     return matrix, refined.reshape(-1, 3), np.repeat(np.arange(len(faces)), 4)
-
-
-def to_torch_csr(matrix: sp.csr_array) -> Tensor:
-    """A scipy CSR matrix as a torch one (float32)."""
-    matrix.sort_indices()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta state")
-        warnings.filterwarnings("ignore", message="Sparse invariant checks")
-        return torch.sparse_csr_tensor(
-            torch.from_numpy(matrix.indptr.astype(np.int32)),
-            torch.from_numpy(matrix.indices.astype(np.int32)),
-            torch.from_numpy(matrix.data.astype(np.float32)),
-            size=matrix.shape,
-        )

@@ -5,6 +5,7 @@
 #include <cstring>
 #include <stdexcept>
 
+#include "cpu_features.hpp"
 #include "instruction_sets.hpp"
 
 namespace mass {
@@ -18,12 +19,8 @@ std::size_t size(int n) { return static_cast<std::size_t>(n); }
 std::vector<const KernelTable*> tables() {
     std::vector<const KernelTable*> found;
 #if defined(MASS_BUILD_X86)
-    __builtin_cpu_init();
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq") &&
-        __builtin_cpu_supports("avx512bw")) {
-        found.push_back(&avx512::table);
-    }
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) found.push_back(&avx2::table);
+    if (has_avx512()) found.push_back(&avx512::table);
+    if (has_avx2()) found.push_back(&avx2::table);
 #endif
     found.push_back(&portable::table);
     found.push_back(&scalar::table);
@@ -63,15 +60,7 @@ std::size_t FrameBuffers::bytes() const {
            touched.bytes() + camera_partial.bytes();
 }
 
-Renderer::Renderer(const std::string& instruction_set) : table_(nullptr) {
-    for (const KernelTable* table : tables()) {
-        if (instruction_set == "auto" || instruction_set == table->name) {
-            table_ = table;
-            return;
-        }
-    }
-    throw std::invalid_argument("no kernel for instruction set " + instruction_set);
-}
+Renderer::Renderer(const std::string& instruction_set) : table_(choose_table(tables(), instruction_set)) {}
 
 std::vector<std::string> Renderer::available() {
     std::vector<std::string> names;

@@ -48,10 +48,20 @@ def truth_points(name: str) -> NDArray[np.float64]:
     return np.asarray(projected[..., :2] / projected[..., 2:], np.float64)
 
 
-def truth_mask(name: str, index: int) -> NDArray[np.bool_]:
-    """Hand, ring and watch of one frame, bool [H,W]."""
+def _mask(name: str, index: int) -> NDArray[np.uint8]:
     mask = cv2.imread(str(TRUTH / name / "masks" / f"{index:06d}.png"), cv2.IMREAD_GRAYSCALE)
-    return np.isin(np.asarray(mask), (80, 160))
+    assert mask is not None
+    return np.asarray(mask, np.uint8)
+
+
+def truth_mask(name: str, index: int) -> NDArray[np.bool_]:
+    """The bare hand of one frame, bool [H,W]."""
+    return np.asarray(_mask(name, index) == 80)
+
+
+def worn_mask(name: str, index: int) -> NDArray[np.bool_]:
+    """Ring and watch of one frame, bool [H,W]."""
+    return np.asarray(_mask(name, index) == 160)
 
 
 def open_hand(x: float = 160.0, y: float = 200.0, scale: float = 1.0) -> NDArray[np.float32]:

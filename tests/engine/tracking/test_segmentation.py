@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from mass_engine.tracking import capsules
 from mass_engine.tracking.models import HandNetworks
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE, HandSegmenter, hand_box
 from mass_engine.tracking.track import track_main_hand
-from tests.engine.tracking.clips import frames, landmarks, needs_truth, open_hand, truth_mask
+from tests.engine.tracking.clips import frames, landmarks, needs_truth, open_hand, truth_mask, worn_mask
 
 SKIN, DARK_SKIN, CLOTH = (205, 150, 125), (95, 65, 52), (60, 70, 130)
 
@@ -64,6 +66,18 @@ def iou(labels: NDArray[np.uint8], truth: NDArray[np.bool_]) -> float:
     judged = labels != IGNORE
     hand = (labels == HAND) & judged
     return float((hand & truth).sum() / ((hand | truth) & judged).sum())
+
+
+def edge_offset(
+    coverage: NDArray[np.float32], truth: NDArray[np.bool_], unjudged: NDArray[np.bool_]
+) -> float:
+    """How far the edge lies outside the true one, pixels, where both are within 4 pixels of it."""
+    within = cv2.distanceTransform(truth.astype(np.uint8), cv2.DIST_L2, 5)
+    without = cv2.distanceTransform((~truth).astype(np.uint8), cv2.DIST_L2, 5)
+    band = (np.maximum(within, without) < 4) & (
+        cv2.dilate(unjudged.astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
+    )
+    return float((coverage - truth)[band].sum() * 8 / max(1, band.sum()))
 
 
 def poses() -> list[NDArray[np.float32]]:
@@ -137,17 +151,63 @@ def test_the_same_input_gives_the_same_mask() -> None:
 
 
 @needs_truth
-@pytest.mark.parametrize(("name", "goal"), [("dev_a", 0.94), ("dev_b", 0.92)])
+@pytest.mark.parametrize(("name", "goal"), [("dev_a", 0.975), ("dev_b", 0.955)])
 def test_overlap_on_the_rendered_clips(name: str, goal: float) -> None:
     clip = frames(name)
     track = track_main_hand(clip, HandNetworks.load(), lambda index: index % 8 == 7)
-    samples = [(clip[i].rgb, track.hands[i]) for i in track.trusted[:: len(track.trusted) // 16]]
+    read = {i: replace(hand, points=hand.as_read) for i, hand in track.hands.items() if hand.trusted}
+    samples = [(clip[i].rgb, read[i]) for i in track.trusted[:: len(track.trusted) // 16]]
     segmenter = HandSegmenter.train(samples)
-    scores, lost = [], []
-    for i in list(track.hands)[::3]:
-        labels = segmenter(clip[i].rgb, track.hands[i]).full(*clip[i].rgb.shape[:2])
-        truth = truth_mask(name, i)
-        scores.append(iou(labels, truth))
+    scores, lost, offsets, painted_over = [], [], [], []
+    for i in list(read)[::3]:
+        mask = segmenter(clip[i].rgb, read[i])
+        labels = mask.full(*clip[i].rgb.shape[:2])
+        truth, worn = truth_mask(name, i), worn_mask(name, i)
+        scores.append(iou(np.where(worn, IGNORE, labels).astype(np.uint8), truth))
         lost.append(float((labels[truth] == IGNORE).mean()))
+        painted_over.append((float((labels[worn] == HAND).sum()), float(worn.sum())))
+        offsets.append(edge_offset(mask.full_coverage(*labels.shape), truth, (labels == IGNORE) | worn))
     assert np.mean(scores) >= goal
     assert np.mean(lost) < 0.02, "a mask must not win by ignoring the hand"
+    assert abs(np.mean(offsets)) < 0.3, "the hand must be neither too fat nor too thin"
+    hidden, total = np.sum(painted_over, axis=0)
+    assert hidden <= 0.1 * total, "a ring or a watch is no hand"
+
+
+def test_coverage_is_soft_at_the_edge_and_agrees_with_the_labels() -> None:
+    scenes = [(*painted(points, SKIN, seed=i), points) for i, points in enumerate(poses())]
+    segmenter = HandSegmenter.train([(image, landmarks(points)) for image, _, points in scenes])
+    for image, _, points in scenes:
+        sharp = segmenter(image, landmarks(points))
+        image = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.uint8)
+        mask = segmenter(image, landmarks(points))
+        assert mask.coverage.dtype == np.float32
+        assert mask.coverage.min() >= 0
+        assert mask.coverage.max() <= 1
+        np.testing.assert_array_equal(mask.coverage > 0.5, mask.labels == HAND)
+        assert (mask.coverage[mask.labels == IGNORE] == 0).all()
+        soft = (mask.coverage > 0.02) & (mask.coverage < 0.98)
+        hard = (sharp.coverage > 0.02) & (sharp.coverage < 0.98)
+        assert soft.sum() > hard.sum() > 0
+
+
+def test_a_thing_over_the_hand_is_ignored_and_the_hand_around_it_is_not() -> None:
+    scenes = [(*painted(points, SKIN, seed=i), points) for i, points in enumerate(poses())]
+    held = []
+    for image, truth, points in scenes:  # a green stick across the palm, longer than the hand is wide
+        thing = np.zeros(truth.shape, np.uint8)
+        x, y = (int(v) for v in points[[0, 4]].mean(0))
+        cv2.rectangle(thing, (x - 60, y - 12), (x + 60, y + 12), 1, -1)
+        noise = np.random.default_rng(1).normal(0, 4, image.shape)
+        green = (np.array((40, 150, 60)) + noise).clip(0, 255).astype(np.uint8)
+        held.append((np.where(thing[..., None] > 0, green, image).astype(np.uint8), truth, thing > 0, points))
+    segmenter = HandSegmenter.train([(image, landmarks(points)) for image, _, _, points in held])
+    for image, truth, hides, points in held:
+        labels = segmenter(image, landmarks(points)).full(*image.shape[:2])
+        assert (labels[hides] == HAND).mean() < 0.03
+        hiding = cv2.erode((hides & truth).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        assert (labels[hiding] == IGNORE).mean() > 0.8
+        above = np.arange(labels.shape[0])[:, None] < points[0, 1]
+        clear = above & (cv2.dilate(hides.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0)
+        assert iou(np.where(clear, labels, IGNORE).astype(np.uint8), truth) > 0.9
+        assert (labels[truth & clear] == IGNORE).mean() < 0.03

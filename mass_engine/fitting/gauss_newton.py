@@ -1,0 +1,348 @@
+"""Gauss-Newton over all frames: every pose from its own evidence, the shared surface from all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from mass_engine.camera import Camera
+from mass_engine.fitting.kinematics import POSE_SIZE, pose_jacobian, shape_jacobian, turned
+from mass_engine.fitting.poses import PoseTable
+from mass_engine.fitting.registration import (
+    Evidence2D,
+    RegistrationWeights,
+    normal_equations,
+    observe,
+    project_jacobian,
+)
+from mass_engine.fitting.subject import Appearance, PosedSurfels, Shape, mesh_edges, render_row, vertex_normals
+from mass_engine.fitting.views import View
+from mass_engine.hand.builtin import joint_frames, joint_limits
+from mass_engine.hand.pose import HandPose
+from mass_engine.hand.rotation import axis_angle_to_matrix, matrix_to_axis_angle
+from mass_engine.raster import RasterOptions
+from mass_engine.surfel.binding import MeshBinding
+from mass_engine.surfel.shading import white_light
+from mass_engine.surfel.subdivision import Subdivision
+from mass_engine.tracking.alignment import hand_size_pixels, interpolate_pose
+from mass_engine.tracking.offsets import tracked_points
+
+#: What one frame (row) says of every surfel's colour: its sum under the blending weights, and these [N,4].
+Gather = Callable[[int], Tensor]
+
+#: Frames whose Jacobians are held at a time.
+CHUNK = 12
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Standard deviations of what a step may assume, in radians and metres."""
+
+    trust: float = 0.05  # evidence of neighbouring pixels errs together: what one pixel counts
+    finger_motion: float = 0.10  # against the mean of the neighbouring frames
+    wrist_motion: float = 0.06
+    shift_motion: float = 0.004
+    limit: float = 0.03  # beyond a joint limit
+    damping: float = 0.15  # largest usual step of an angle
+    shift_damping: float = 0.01
+    betas: float = 1.0
+    offset: float = 0.008  # of the personal surface
+    offset_bend: float = 0.0012  # between neighbouring vertices
+    frames: float = 1.0  # evidence of neighbouring frames errs together
+    landmark: float = 0.08  # of the tracker's points, hand sizes
+    landmark_knee: float = 0.08  # from here on a point's error counts linearly, hand sizes
+
+
+@dataclass(frozen=True)
+class Round:
+    """One Gauss-Newton step of every frame at a resolution."""
+
+    side: int
+    texture: bool = True
+    betas: bool = True
+    offsets: bool = True
+    weights: RegistrationWeights = field(default_factory=RegistrationWeights)
+
+
+class Registrar:
+    """Steps of the rows of ``table`` and of ``shape``."""
+
+    def __init__(
+        self,
+        views: list[View],
+        table: PoseTable,
+        shape: Shape,
+        camera: Camera,
+        raster: RasterOptions,
+        priors: Priors | None = None,
+    ) -> None:
+        self.views, self.table, self.shape = views, table, shape
+        self.camera, self.raster = camera, raster
+        self.priors = priors or Priors()
+        self._limits, self._axes = joint_limits().double(), joint_frames(shape.model).double()
+        self._edges = mesh_edges(shape.model.faces)
+        self._trained = [row for row, view in enumerate(views) if not view.heldout]
+        self._points = torch.stack([torch.from_numpy(view.points) for view in views])
+        self._sizes = hand_size_pixels(self._points)
+        self._at_joints = torch.tensor([view.at_joints for view in views])
+
+    def step(
+        self,
+        stage: Round,
+        binding: MeshBinding,
+        appearance: Appearance,
+        rows: list[int] | None = None,
+        motion: bool = True,
+    ) -> float:
+        """One step; returns the mean length of the evidence's pull in pixels of the level.
+
+        Without ``rows`` all training rows and the shared surface move; with ``rows`` only their poses.
+        """
+        shared = rows is None
+        chosen = self._trained if rows is None else rows
+        subdivision = binding.subdivision
+        targets = self._between(chosen)
+        if not motion:
+            targets[1].zero_()
+        count, vertices = len(self.shape.model.template), subdivision.n_vertices
+        systems: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]] = []
+        blocks, sides = torch.zeros(vertices, 3, 3), torch.zeros(vertices, 3)
+        pulls: list[float] = []
+        for start in range(0, len(chosen), CHUNK):
+            part = chosen[start : start + CHUNK]
+            pose = self._poses(part)
+            jacobian = pose_jacobian(self.shape, subdivision, pose)
+            of_shape = shape_jacobian(self.shape, subdivision, pose) if shared and stage.betas else None
+            with torch.no_grad():
+                attached = binding.register(jacobian.vertices)
+                hand = self.shape.model.posed(pose, self.shape.displacement)
+            surfels = PosedSurfels(attached, jacobian.vertices, hand.bone_transforms[..., :3, :3], hand.joints)
+            for place, row in enumerate(part):
+                level = self.views[row].level(stage.side)
+                with torch.no_grad():
+                    out = render_row(appearance, surfels, place, binding.bones, level.camera, self.raster)
+                skin = jacobian.vertices[place]
+                evidence = observe(
+                    level, out, skin, vertex_normals(skin, subdivision.faces), stage.weights, stage.texture
+                )
+                onto = project_jacobian(level, skin)
+                j = onto @ jacobian.of(place)
+                p = j.shape[-1]
+                if of_shape is not None:
+                    j = torch.cat([j, onto @ of_shape[place]], -1)
+                a, b = normal_equations(evidence, j)
+                a, b = a * self.priors.trust, b * self.priors.trust
+                systems.append((a[:p, :p], b[:p], a[p:, :p], a[p:, p:], b[p:]))
+                pulls.append(_pull(evidence))
+                if shared and stage.offsets:
+                    lever = onto @ jacobian.turns[place]
+                    h = evidence.matrices() @ lever
+                    blocks += lever.mT @ h
+                    sides += (lever.mT @ evidence.gradient.unsqueeze(-1)).squeeze(-1)
+        steps, betas = self._solve(chosen, systems, targets)
+        self._move(chosen, steps)
+        if shared and stage.betas:
+            self.shape.betas += betas.clamp(-0.5, 0.5).float()
+        if shared and stage.offsets:
+            self._move_surface(subdivision, blocks, sides, count)
+        return sum(pulls) / max(len(pulls), 1)
+
+    def sweep(self, stages: Sequence[Round], binding: MeshBinding, gather: Gather, memory: float = 0.95) -> None:
+        """Register frame after frame, outward from the one that shows most, against the texture so far.
+
+        A texture averaged over badly registered frames is flat and pulls nowhere; one that grows from a
+        single frame is sharp from the start. A frame begins with its neighbour's correction.
+        """
+        trained = self._trained
+        key = max(range(len(trained)), key=lambda place: float((self.views[trained[place]].labels == 255).sum()))
+        total = torch.zeros(binding.count, 4)
+        moved: dict[int, Tensor] = {}
+        for place in sorted(range(len(trained)), key=lambda place: abs(place - key)):
+            row = trained[place]
+            before = self._poses([row])
+            if place != key:
+                near = moved[place - 1 if place > key else place + 1]
+                self.table.put(torch.tensor([row]), turned(before, near))
+                known = total[:, 3:] > 0.05
+                mean = total[:, :3].sum(0) / total[:, 3].sum()
+                albedo = torch.where(known, total[:, :3] / total[:, 3:].clamp_min(1e-6), mean)
+                look = plain(binding, albedo)
+                for stage in stages:
+                    self.step(stage, binding, look, [row], motion=False)
+            moved[place] = difference(before, self._poses([row]))
+            total = total * memory + gather(row)
+
+    def _poses(self, rows: list[int]) -> HandPose:
+        index = torch.tensor(rows)
+        leaves = {name: value[index] for name, value in self.table.values.items()}
+        return self.table.pose(self.shape.betas, leaves)
+
+    def _between(self, rows: list[int]) -> tuple[Tensor, Tensor]:
+        """How each row would have to turn [B,51] to lie between its training neighbours, and how near
+        these are [B] (1 at 30 frames a second, 0 at an end)."""
+        targets, near = torch.zeros(len(rows), POSE_SIZE, dtype=torch.float64), torch.zeros(len(rows), dtype=torch.float64)
+        for place, row in enumerate(rows):
+            earlier = [other for other in self._trained if other < row][-1:]
+            later = [other for other in self._trained if other > row][:1]
+            if not earlier or not later:
+                continue
+            pair = self._poses(earlier + later)
+            times = [self.views[earlier[0]].time, self.views[later[0]].time]
+            middle = interpolate_pose(pair, times, [self.views[row].time])
+            own = self._poses([row])
+            for name, columns in (("global_orient", slice(0, 3)), ("hand_pose", slice(3, 48))):
+                goal = axis_angle_to_matrix(getattr(middle, name).double().view(-1, 3))
+                here = axis_angle_to_matrix(getattr(own, name).double().view(-1, 3))
+                targets[place, columns] = matrix_to_axis_angle(goal @ here.mT).flatten()
+            targets[place, 48:] = (middle.transl - own.transl)[0].double()
+            near[place] = min(1.0, ((times[1] - times[0]) * 15) ** -2)
+        return targets, near
+
+    def _solve(
+        self,
+        rows: list[int],
+        systems: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]],
+        targets: tuple[Tensor, Tensor],
+    ) -> tuple[Tensor, Tensor]:
+        """Steps [B,51] of the poses and [10] of the shape: the poses are eliminated first (Schur)."""
+        p = self.priors
+        motion = torch.cat(
+            [torch.full((3,), p.wrist_motion), torch.full((45,), p.finger_motion), torch.full((3,), p.shift_motion)]
+        ).double()
+        damping = torch.cat([torch.full((48,), p.damping), torch.full((3,), p.shift_damping)]).double()
+        pull, near = targets
+        limit, limit_side = self._limit_terms(rows)
+        mark, mark_side = self._landmark_terms(rows)
+        own = torch.stack([a for a, *_ in systems]) + limit + mark
+        side = torch.stack([b for _, b, *_ in systems]) + limit_side + mark_side
+        weight = near.unsqueeze(-1) / motion.square()
+        own = own + torch.diag_embed(weight + damping**-2)
+        side = side + weight * pull
+        cross = torch.stack([c for _, _, c, _, _ in systems])
+        if cross.shape[1] == 0:
+            return torch.linalg.solve(own, side.unsqueeze(-1)).squeeze(-1), torch.zeros(0)
+        k = p.frames
+        shape = k * torch.stack([d for *_, d, _ in systems]).sum(0)
+        shape_side = k * torch.stack([e for *_, e in systems]).sum(0)
+        shape = shape + torch.eye(10).double() * (p.betas**-2 + 0.3**-2)
+        shape_side = shape_side - self.shape.betas.double() * p.betas**-2
+        solved = torch.linalg.solve(own, torch.cat([cross.mT, side.unsqueeze(-1)], -1))
+        reduced = shape - k * (cross @ solved[..., :-1]).sum(0)
+        reduced_side = shape_side - k * (cross @ solved[..., -1:]).sum(0).squeeze(-1)
+        betas = torch.linalg.solve(reduced, reduced_side)
+        return solved[..., -1] - solved[..., :-1] @ betas, betas
+
+    def _limit_terms(self, rows: list[int]) -> tuple[Tensor, Tensor]:
+        """Quadratic walls beyond the joint limits."""
+        index = torch.tensor(rows)
+        angles = torch.einsum("jab,rjb->rja", self._axes, self.table.values["hand_pose"][index].double().unflatten(1, (15, 3)))
+        low, high = self._limits[..., 0] - angles, angles - self._limits[..., 1]
+        beyond = torch.where(low > 0, low, torch.where(high > 0, -high, torch.zeros_like(low)))
+        strength = (beyond != 0).double() / self.priors.limit**2
+        matrix = torch.zeros(len(rows), POSE_SIZE, POSE_SIZE, dtype=torch.float64)
+        side = torch.zeros(len(rows), POSE_SIZE, dtype=torch.float64)
+        blocks = self._axes.mT @ (strength.unsqueeze(-1) * self._axes)
+        for joint in range(15):
+            at = slice(3 + 3 * joint, 6 + 3 * joint)
+            matrix[:, at, at] = blocks[:, joint]
+        side[:, 3:48] = ((strength * beyond).unsqueeze(-2) @ self._axes).squeeze(-2).flatten(1)
+        return matrix, side
+
+    def _landmark_terms(self, rows: list[int]) -> tuple[Tensor, Tensor]:
+        """The tracker's points, robustly: they say which finger is where when outlines cannot."""
+        p = self.priors
+        index = torch.tensor(rows)
+        pose = self._poses(rows)
+        step = torch.zeros(len(rows), POSE_SIZE)
+
+        def marks(step: Tensor) -> Tensor:
+            joints, turns = self.shape.model.skeleton(turned(pose, step))
+            return tracked_points(joints, turns, self.shape.model.side, self._at_joints[index])
+
+        with torch.no_grad():
+            here = self.camera.project(marks(step))
+            columns = []
+            for number in range(POSE_SIZE):
+                moved = step.clone()
+                moved[:, number] = 1e-3
+                columns.append((self.camera.project(marks(moved)) - here) / 1e-3)
+        jacobian = (torch.stack(columns, -1) / self._sizes[index].view(-1, 1, 1, 1)).double()
+        apart = ((self._points[index] - here) / self._sizes[index].view(-1, 1, 1)).double()
+        length = apart.norm(dim=-1).clamp_min(1e-9)
+        scores = torch.tensor([self.views[row].score for row in rows], dtype=torch.float64)
+        weight = scores[:, None] * torch.where(length < p.landmark_knee, 1.0, p.landmark_knee / length) / p.landmark**2
+        weighted = jacobian * weight[..., None, None]
+        flat = jacobian.flatten(1, 2)
+        return flat.mT @ weighted.flatten(1, 2), (weighted.flatten(1, 2).mT @ apart.flatten(1, 2).unsqueeze(-1)).squeeze(-1)
+
+    def _move(self, rows: list[int], steps: Tensor) -> None:
+        limited = steps.float()
+        limited[:, :48] = limited[:, :48].clamp(-0.3, 0.3)
+        limited[:, 48:] = limited[:, 48:].clamp(-0.03, 0.03)
+        good = torch.isfinite(limited).all(-1)
+        index = torch.tensor(rows)[good]
+        self.table.put(index, turned(self._poses(index.tolist()), limited[good]))
+
+    def _move_surface(self, subdivision: Subdivision, blocks: Tensor, sides: Tensor, count: int) -> None:
+        """The rest surface's offsets [V,3]: evidence of all frames against smoothness, by conjugate gradients."""
+        p = self.priors
+        k = p.frames * p.trust
+        edges = self._edges
+
+        def smooth(d: Tensor) -> Tensor:
+            between = (d[edges[:, 0]] - d[edges[:, 1]]) / p.offset_bend**2
+            total = d / p.offset**2
+            return total.index_add(0, edges[:, 0], between).index_add(0, edges[:, 1], -between)
+
+        def transpose(values: Tensor) -> Tensor:
+            return values if subdivision._transpose is None else subdivision._transpose @ values
+
+        def apply(d: Tensor) -> Tensor:
+            return k * transpose((blocks @ subdivision.apply(d).unsqueeze(-1)).squeeze(-1)) + smooth(d)
+
+        right = k * transpose(sides) - smooth(self.shape.displacement)
+        step = conjugate_gradients(apply, right, 60)
+        self.shape.displacement += step.clamp(-0.003, 0.003)
+
+
+def difference(before: HandPose, after: HandPose) -> Tensor:
+    """The step [B,51] that :func:`turned` takes from ``before`` to ``after``."""
+    columns = []
+    for name in ("global_orient", "hand_pose"):
+        goal = axis_angle_to_matrix(getattr(after, name).unflatten(-1, (-1, 3)))
+        here = axis_angle_to_matrix(getattr(before, name).unflatten(-1, (-1, 3)))
+        columns.append(matrix_to_axis_angle(goal @ here.mT).flatten(1))
+    return torch.cat([*columns, after.transl - before.transl], -1)
+
+
+def plain(binding: MeshBinding, albedo: Tensor) -> Appearance:
+    """Opaque surfels of one colour from everywhere."""
+    return Appearance(albedo, torch.full((binding.count,), 3.0), torch.zeros(binding.count, 0, 3), white_light())
+
+
+def conjugate_gradients(apply: Callable[[Tensor], Tensor], right: Tensor, iterations: int) -> Tensor:
+    """x with apply(x) = right for a symmetric positive operator, from zero."""
+    x, residual = torch.zeros_like(right), right.clone()
+    direction, power = residual, float(residual.square().sum())
+    first = power
+    for _ in range(iterations):
+        if power <= 1e-12 * first or power == 0.0:
+            break
+        moved = apply(direction)
+        along = power / float((direction * moved).sum())
+        x = x + along * direction
+        residual = residual - along * moved
+        new = float(residual.square().sum())
+        direction, power = residual + (new / power) * direction, new
+    return x
+
+
+def _pull(evidence: Evidence2D) -> float:
+    weight = evidence.hessian[:, 0] + evidence.hessian[:, 2]
+    used = weight > 0
+    if not bool(used.any()):
+        return 0.0
+    return float((evidence.gradient[used].norm(dim=-1) / weight[used]).mean())

@@ -117,7 +117,7 @@ class Avatar:
     def _shaded(self, pose: HandPose, camera: Camera) -> ShadedSurfels:
         """The kept surfels in one pose (a batch of one) as ``camera`` sees them."""
         with torch.no_grad(), one_thread():
-            hand = self.shape.model.posed(pose, self.shape.offsets())
+            hand = self.shape.model.posed(pose, self.shape.displacement)
             refined = self.binding.subdivision.apply(hand.vertices)[0]
             center = -camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3]
             bones = hand.bone_transforms[0, :, :3, :3]

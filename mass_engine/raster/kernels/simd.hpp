@@ -96,13 +96,16 @@ MASS_INLINE Nf part_set(float x) { return x; }
 MASS_INLINE Ni part_lt(Nf a, Nf b) { return (Ni)(a < b); }
 MASS_INLINE Ni part_le(Nf a, Nf b) { return (Ni)(a <= b); }
 MASS_INLINE Ni part_eq(Nf a, Nf b) { return (Ni)(a == b); }
-MASS_INLINE Nf part_set(float x) { return Nf{} + x; }
 #if MASS_WIDTH == 8
+MASS_INLINE Nf part_set(float x) { return Nf{x, x, x, x, x, x, x, x}; }
 MASS_INLINE Nf part_fma(Nf a, Nf b, Nf c) { return (Nf)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
-#elif defined(__aarch64__)
+#else
+MASS_INLINE Nf part_set(float x) { return Nf{x, x, x, x}; }
+#if defined(__aarch64__)
 MASS_INLINE Nf part_fma(Nf a, Nf b, Nf c) { return vfmaq_f32(c, a, b); }
 #else
 MASS_INLINE Nf part_fma(Nf a, Nf b, Nf c) { return a * b + c; }
+#endif
 #endif
 #endif
 MASS_INLINE Ni part_bits(Nf a) {
@@ -149,10 +152,11 @@ MASS_INLINE F splat(float x) {
 }
 MASS_INLINE F load(const float* p) {
     F r;
-    __builtin_memcpy(&r, p, sizeof r);
+    // Part by part: copied as a whole it goes through memory in pieces that its parts then wait for.
+    MASS_PARTS __builtin_memcpy(&r.v[i], p + i * MASS_WIDTH, sizeof r.v[i]);
     return r;
 }
-MASS_INLINE void store(float* p, F x) { __builtin_memcpy(p, &x, sizeof x); }
+MASS_INLINE void store(float* p, F x) { MASS_PARTS __builtin_memcpy(p + i * MASS_WIDTH, &x.v[i], sizeof x.v[i]); }
 MASS_INLINE F fma(F a, F b, F c) {
     F r;
     MASS_PARTS r.v[i] = part_fma(a.v[i], b.v[i], c.v[i]);

@@ -160,6 +160,7 @@ def _fit_hand(
         frames={
             "tracked": clip.tracked,
             "not_trusted": clip.doubted,
+            "estimated": clip.estimated,
             "fitted": [view.index for view in clip.views if not view.heldout],
             "heldout": [view.index for view in clip.views if view.heldout],
             "choice": clip.choice.summary(),

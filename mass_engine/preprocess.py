@@ -43,7 +43,7 @@ HELDOUT_LIMIT = 160
 @dataclass(frozen=True)
 class Clip:
     """``views`` in time order with their ``start`` poses [F]; ``tracked`` counts frames with the hand, of
-    which those of ``doubted`` are not used.
+    which those of ``doubted`` are not used; ``estimated``: see :class:`mass_engine.survey.SurveyedHand`.
 
     ``template`` is the name of what ``model`` comes from; ``choice`` says why these frames are fitted;
     ``fov_source`` see :class:`mass_engine.survey.SurveyedHand`.
@@ -59,6 +59,7 @@ class Clip:
     frames_read: int
     tracked: int
     doubted: list[int]
+    estimated: list[int]
     choice: FrameChoice
 
 
@@ -92,8 +93,9 @@ def prepare_hand(
         views,
         start,
         len(found.times),
-        len(hand.marks) + len(hand.doubted),
+        hand.tracked,
         hand.doubted,
+        hand.estimated,
         choice,
     )
 

@@ -38,9 +38,11 @@ Warn = Callable[[str, str, str], None]
 class SurveyedHand:
     """One hand over the clip: trusted ``marks`` in time order and their ``quality`` by frame.
 
-    ``doubted`` frames show it, but are outliers or mixed up with another hand. ``others`` is the other hand
-    by frame, where one is followed. ``fov_source``: ``given`` by the user, from the file's ``metadata``,
-    known to the imported ``tracks``, or ``assumed``.
+    ``tracked`` counts the frames that show it; of these the ``doubted`` ones are outliers or mixed up with
+    another hand. ``estimated`` are held-out frames among the marks that were misread or lost, and follow from
+    their neighbours (no quality). ``others`` is the other hand by frame, where one is followed.
+    ``fov_source``: ``given`` by the user, from the file's ``metadata``, known to the imported ``tracks``, or
+    ``assumed``.
     """
 
     side: Side
@@ -48,7 +50,9 @@ class SurveyedHand:
     quality: Mapping[int, FrameQuality]
     camera: Camera
     fov_source: str
+    tracked: int
     doubted: list[int] = field(default_factory=list)
+    estimated: list[int] = field(default_factory=list)
     others: Mapping[int, HandLandmarks] = field(default_factory=dict)
     imported: Tracks | None = None
 
@@ -136,7 +140,20 @@ def _tracked(
         mixed = mixed_frames(track.hands, others)
         marks = [mark for i, mark in track.hands.items() if mark.trusted and i not in mixed]
         doubted = [i for i, mark in track.hands.items() if not mark.trusted or i in mixed]
-        judged.append(SurveyedHand(track.side, marks, seen.of(marks), camera, source, doubted, others))
+        estimated = [mark for i, mark in track.estimated.items() if i not in mixed]
+        judged.append(
+            SurveyedHand(
+                track.side,
+                sorted([*marks, *estimated], key=lambda mark: mark.index),
+                seen.of(marks),
+                camera,
+                source,
+                len(track.hands),
+                doubted,
+                [mark.index for mark in estimated],
+                others,
+            )
+        )
     same_side = {track.side: track.same_side for track, _ in tracks}
     return _judged(judged, same_side, options, warn)
 
@@ -241,6 +258,7 @@ def _imported(
                 seen.of(marks),
                 replace(camera, K=one.tracks.K) if known else camera,
                 "tracks" if known else source,
+                len(marks),
                 others=given[1 - number] if len(given) == 2 else {},
                 imported=one.tracks,
             )

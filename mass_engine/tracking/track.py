@@ -6,13 +6,14 @@ Nothing here about a frame that is not held out depends on a frame that is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mass_engine.errors import EngineError
 from mass_engine.hand.pose import Side
+from mass_engine.tracking.between import between
 from mass_engine.tracking.continuity import FlowRecorder, bridge
 from mass_engine.tracking.landmarks import BONES, HandLandmarks
 from mass_engine.tracking.models import HandNetworks
@@ -36,6 +37,7 @@ class Track:
     share of the vote that went to it; ``times`` in seconds of all frames read; ``heldout`` frame indices;
     ``width``, ``height`` of the frames in pixels; ``other_hands`` the most frames in which any one other
     hand was followed; ``same_side`` those in which another hand, surely of the same side, was seen beside it.
+    ``estimated``: held-out frames in which it was misread or lost, from their neighbours (:mod:`.between`).
     """
 
     side: Side
@@ -47,6 +49,7 @@ class Track:
     height: int
     other_hands: int
     same_side: int = 0
+    estimated: Mapping[int, HandLandmarks] = field(default_factory=dict)
 
     @property
     def missed(self) -> list[int]:
@@ -131,12 +134,11 @@ def main_hand(
     hands, doubted = _put_right(hands, flow)
     trusted = {i: h for i, h in hands.items() if i not in doubted}
     marked = {i: replace(h, side=side, trusted=i not in doubted) for i, h in hands.items()}
-    for index in sorted(held & found.keys()):
-        picked = _pick(found[index], chosen, trusted)
-        if picked is not None:
-            marked[index] = replace(picked, side=side, trusted=_jump(picked, trusted) <= _JUMP)
-    ordered = dict(sorted(marked.items()))
-    return Track(side, max(right, 1 - right), ordered, tuple(times), held, width, height, others, same)
+    read = {index: _pick(found[index], chosen, trusted) for index in sorted(held & found.keys())}
+    kept, estimated = _hold_out(read, marked, trusted)
+    return Track(
+        side, max(right, 1 - right), kept, tuple(times), held, width, height, others, same, estimated
+    )
 
 
 def both_hands(
@@ -166,17 +168,17 @@ def both_hands(
         hands, doubted = _put_right(hands, flow)
         trusted = {i: h for i, h in hands.items() if i not in doubted}
         marked = {i: replace(h, side=side, trusted=i not in doubted) for i, h in hands.items()}
+        read: dict[int, HandLandmarks | None] = {}
         for index in sorted(held & found.keys()):
             # A held-out frame is read from where the frame before left the tracker: its tracks are those.
             before = max((i for i in labelled if i < index), default=None)
             last = None if before is None else labelled[before].get(side)
-            picked = _pick(found[index], [] if last is None else [last.track], trusted)
-            if picked is not None:
-                marked[index] = replace(picked, side=side, trusted=_jump(picked, trusted) <= _JUMP)
+            read[index] = _pick(found[index], [] if last is None else [last.track], trusted)
+        kept, estimated = _hold_out(read, marked, trusted)
         others = sum(side not in pair for pair in labelled.values())
         certainty = right if side == "right" else 1 - right
         tracks[side] = Track(
-            side, certainty, dict(sorted(marked.items())), tuple(times), held, width, height, others
+            side, certainty, kept, tuple(times), held, width, height, others, estimated=estimated
         )
     if not tracks:
         raise errors[0]
@@ -198,6 +200,25 @@ def _put_right(
         return dict(hands), _outliers(hands)
     bridged, loose = bridge(hands, flow)
     return bridged, _outliers(bridged) | loose
+
+
+def _hold_out(
+    read: Mapping[int, HandLandmarks | None],
+    hands: Mapping[int, HandLandmarks],
+    trusted: Mapping[int, HandLandmarks],
+) -> tuple[dict[int, HandLandmarks], dict[int, HandLandmarks]]:
+    """``hands`` with what was ``read`` in held-out frames, in order; and estimates where that is not to be
+    trusted, or nothing was read."""
+    kept, estimated = dict(hands), {}
+    side = next(iter(hands.values())).side
+    for index, hand in read.items():
+        good = hand is not None and _jump(hand, trusted) <= _JUMP
+        if hand is not None:
+            kept[index] = replace(hand, side=side, trusted=good)
+        guess = None if good else between(index, hand, hands, trusted)
+        if guess is not None:
+            estimated[index] = guess
+    return dict(sorted(kept.items())), estimated
 
 
 def _choose(runs: Mapping[int, Mapping[int, HandLandmarks]]) -> list[int]:

@@ -4,9 +4,9 @@
 CLIP_DIR/video.mp4 and prints, before and after silhouette refinement: 2-D landmark error, 3-D joint error
 and surface distance after a similarity alignment per frame (one view fixes no scale), and the silhouette IoU
 of the posed built-in hand; once: tracked frames and mask IoU. Where some tracked frames are not trusted, so
-not fitted, all of it once more with them, aligned and refined like the others. With ``--noise`` also the 3-D joint error when
-Gaussian noise of so many radians is added to every joint angle of the aligned poses, which are then aligned
-and refined again.
+not fitted, all of it once more with them, aligned and refined like the others. With ``--noise`` also the 3-D
+joint error when Gaussian noise of so many radians is added to every joint angle of the aligned poses, which
+are then aligned and refined again.
 """
 
 from __future__ import annotations

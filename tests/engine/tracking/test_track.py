@@ -131,7 +131,7 @@ def test_a_held_out_frame_is_not_estimated_where_the_hand_may_be_gone() -> None:
 def test_an_estimate_beyond_the_trusted_frames_has_their_pose_where_the_hand_was_read() -> None:
     found = moving_hand(range(20))
     last = found[18][0].points
-    far = found[19][0].points + np.float32((0, 150))
+    far = found[19][0].points + np.array((0, 150), np.float32)
     found[19] = [replace(found[19][0], points=far)]
     estimate = choose(found, 20, {19}).estimated[19]
     np.testing.assert_allclose(estimate.points - estimate.points[0], last - last[0], atol=1e-3)

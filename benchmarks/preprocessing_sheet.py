@@ -68,7 +68,10 @@ def main() -> None:
     arguments = parser.parse_args()
     meter = ProgressMeter(lambda *_: None)
     clip = prepare(arguments.video, FitOptions(), meter, lambda code, text, _: print(f"{code}: {text}"))
-    print(f"{clip.tracked} of {clip.frames_read} frames tracked, side {clip.model.side}")
+    print(
+        f"{clip.tracked} of {clip.frames_read} frames tracked, side {clip.model.side}, "
+        f"not trusted: {clip.doubted}"
+    )
     shape, pose = refine(clip, clip.start)
     pose = replace(pose, betas=shape.betas.expand_as(pose.betas))
     binding = MeshBinding.build(clip.model, 1, 1)

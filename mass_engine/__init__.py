@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from mass_engine.camera import Camera
     from mass_engine.errors import BadArgumentError, EngineError
     from mass_engine.options import FitOptions
-    from mass_engine.pipeline import fit
+    from mass_engine.pipeline import fit, fit_hands
 
-__all__ = ["Avatar", "BadArgumentError", "Camera", "EngineError", "FitOptions", "fit"]
+__all__ = ["Avatar", "BadArgumentError", "Camera", "EngineError", "FitOptions", "fit", "fit_hands"]
 
 _HOMES = {
     "Avatar": "avatar",
@@ -23,6 +23,7 @@ _HOMES = {
     "EngineError": "errors",
     "FitOptions": "options",
     "fit": "pipeline",
+    "fit_hands": "pipeline",
 }
 
 

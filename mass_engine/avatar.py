@@ -266,6 +266,13 @@ class Avatar:
         """
         source = Path(path)
         source = source / FILE_NAME if source.is_dir() else source
+        sides = [side for side in ("right", "left") if (source.parent / side / FILE_NAME).is_file()]
+        if not source.is_file() and sides:
+            raise EngineError(
+                "avatar.not_found",
+                f"{source.parent} holds the avatars of a person's hands.",
+                f"Choose one: {' or '.join(str(source.parent / side) for side in sides)}.",
+            )
         if not source.is_file():
             raise EngineError("avatar.not_found", f"There is no avatar at {source}.", "Fit one first.")
         try:

@@ -44,13 +44,21 @@ def build_parser() -> argparse.ArgumentParser:
         "harp:); after the path ,mano=FILE or ,offset=N or ,undistorted=yes",
     )
     fit.add_argument(
-        "--masks", type=Path, metavar="DIR", help="DIR/%%06d.png: 0 background, 128 ignore, 255 hand"
+        "--masks",
+        type=Path,
+        metavar="DIR",
+        help="DIR/%%06d.png: 0 background, 128 ignore, 255 hand; for both hands DIR/right/ and DIR/left/",
+    )
+    fit.add_argument(
+        "--side",
+        choices=SIDES,
+        default="auto",
+        help="which hand; both: a person's two hands, as RUN/right and RUN/left",
     )
     fit.add_argument(
         "--segmenter", choices=SEGMENTERS, default="colors", help="how masks are made; sam-hq is an extra"
     )
     fit.add_argument("--segmenter-weights", type=Path, metavar="FILE", help="your SAM-HQ checkpoint")
-    fit.add_argument("--side", choices=SIDES, default="auto")
     fit.add_argument("--preset", choices=PRESETS, default="auto")
     fit.add_argument(
         "--holdout", type=int, default=0, metavar="N", help="keep every N-th frame out of the fit"
@@ -157,7 +165,10 @@ def _fit(arguments: argparse.Namespace) -> None:
         fov=arguments.fov,
         max_frames=arguments.max_frames,
     )
-    from mass_engine.pipeline import fit_to_directory  # heavy imports only once the arguments are good
+    # Heavy imports only once the arguments are good.
+    from mass_engine.pipeline import fit_hands_to_directory, fit_to_directory
+
+    fit = fit_hands_to_directory if options.side == "both" else fit_to_directory
 
     if arguments.json:
 
@@ -174,14 +185,14 @@ def _fit(arguments: argparse.Namespace) -> None:
         def warn(code: str, message: str, advice: str) -> None:
             _emit(type="warning", code=code, message=message, advice=advice)
 
-        fit_to_directory(arguments.video, arguments.out, options, report, warn)
+        fit(arguments.video, arguments.out, options, report, warn)
         _emit(type="done", report=str(arguments.out / "report.json"))
         return
 
     from mass_engine.terminal import TerminalProgress
 
     with TerminalProgress() as bar:
-        result = fit_to_directory(arguments.video, arguments.out, options, bar.report, bar.warn)
+        result = fit(arguments.video, arguments.out, options, bar.report, bar.warn)
     print(result.summary())
     print(f"wrote {arguments.out}")
 

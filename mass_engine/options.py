@@ -10,7 +10,7 @@ from mass_engine.template_spec import parse_template
 from mass_engine.tracks_spec import parse_tracks
 
 PRESETS = ("draft", "auto", "full")
-SIDES = ("auto", "left", "right")
+SIDES = ("auto", "left", "right", "both")
 DEVICES = ("auto", "cpu", "cuda")
 SEGMENTERS = ("colors", "sam-hq")
 
@@ -21,12 +21,16 @@ class FitOptions:
 
     ``template``: see :mod:`mass_engine.template_spec`; ``tracks``: :mod:`mass_engine.tracks_spec`.
 
+    ``side`` of the hand to fit: ``auto`` the most prominent one, ``both`` a person's two hands, each of them
+    an avatar of its own (``masks`` then has a folder ``right`` and a folder ``left``).
+
     ``masks`` is a folder of masks to use instead of made ones; ``segmenter`` says how masks are made, and
     ``segmenter_weights`` is the checkpoint that "sam-hq" needs.
 
     ``holdout`` N keeps the frames N-1, 2N-1, ... out of the fit (0: none). ``fov`` in degrees spans the
-    longer image side; None takes the phone-like default and says so in the report. ``max_frames`` bounds
-    the frames the fit sees; held-out frames do not count.
+    longer image side; None takes what the file says or a phone-like default; the report says which.
+    ``max_frames`` bounds the frames the fit sees; held-out frames do not count, of which at most 160 (or
+    ``max_frames``, if that is more) are kept, evenly spread.
     """
 
     template: str = "builtin"

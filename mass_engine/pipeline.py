@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,23 @@ import cv2
 import torch
 
 from mass_engine.avatar import Avatar, row_pose
+from mass_engine.errors import BadArgumentError
 from mass_engine.evaluation.scores import mean_scores, score_view
 from mass_engine.export.ply import write_ply
-from mass_engine.fitting.report import FitReport, machine, peak_memory_bytes, versions
+from mass_engine.fitting.report import (
+    SHARED_STAGES,
+    FitReport,
+    HandsReport,
+    machine,
+    peak_memory_bytes,
+    versions,
+)
 from mass_engine.fitting.trainer import FitResult, fit_hand, schedule_for
 from mass_engine.options import FitOptions
-from mass_engine.preprocess import Clip, Warn, prepare
-from mass_engine.progress import Progress, ProgressMeter
+from mass_engine.preprocess import Clip, prepare_hand
+from mass_engine.progress import FIT_STAGES, Progress, ProgressMeter
+from mass_engine.survey import Survey, SurveyedHand, Warn, survey
+from mass_engine.tracking.sides import SIDES
 from mass_engine.tracking.tracks import Tracks, write_tracks
 
 #: Frames shown in previews/.
@@ -35,23 +46,92 @@ class FitOutcome:
     clip: Clip
 
 
+Report = Callable[[Progress], None]
+
+
 def fit(
     video: Path,
     options: FitOptions | None = None,
-    report: Callable[[Progress], None] | None = None,
+    report: Report | None = None,
     warn: Warn | None = None,
 ) -> FitOutcome:
-    """Reconstruct the hand in ``video``. Raises EngineError when the video cannot be used."""
+    """Reconstruct the hand in ``video``. Raises EngineError when the video cannot be used, BadArgumentError
+    ``options.invalid`` for ``side="both"``: see :func:`fit_hands`."""
     options = options or FitOptions()
-    warnings: list[dict[str, str]] = []
-
-    def note(code: str, message: str, advice: str) -> None:
-        warnings.append({"code": code, "message": message, "advice": advice})
-        if warn is not None:
-            warn(code, message, advice)
-
+    if options.side == "both":
+        raise BadArgumentError(
+            "options.invalid", "fit() makes one avatar.", "Use fit_hands() for both hands, or another side."
+        )
+    notes = _Notes(warn)
     meter = ProgressMeter(report or (lambda _: None))
-    clip = prepare(video, options, meter, note)
+    found = survey(video, options, meter, notes)
+    return _fit_hand(video, found, found.hands[0], options, meter, notes)
+
+
+def fit_hands(
+    video: Path,
+    options: FitOptions | None = None,
+    report: Report | None = None,
+    warn: Warn | None = None,
+) -> Iterator[FitOutcome]:
+    """Reconstruct both hands of the person in ``video`` (or the one there is), the right one first.
+
+    ``options.side`` is taken as ``both``. One hand after the other, as the results are asked for: only one
+    of them is in memory. Raises EngineError when the video cannot be used.
+    """
+    options = replace(options or FitOptions(), side="both")
+    shared = {name: share for name, share in FIT_STAGES.items() if name in SHARED_STAGES}
+    own = {name: share for name, share in FIT_STAGES.items() if name not in shared}
+    notes, whole = _Notes(warn), _Whole(report or (lambda _: None))
+    first = sum(shared.values())
+    meter = ProgressMeter(whole.part(0.0, first, ""), shared)
+    found = survey(video, options, meter, notes)
+    meter.close()
+    for number, hand in enumerate(found.hands):
+        share = (1 - first) / len(found.hands)
+        note = f"{hand.side} hand" if len(found.hands) > 1 else ""
+        part = ProgressMeter(whole.part(first + number * share, share, note), own)
+        part.seconds |= meter.seconds
+        yield _fit_hand(video, found, hand, options, part, notes)
+
+
+class _Notes:
+    """Collects warnings for the report and passes them on."""
+
+    def __init__(self, warn: Warn | None) -> None:
+        self.warnings: list[dict[str, str]] = []
+        self._warn = warn
+
+    def __call__(self, code: str, message: str, advice: str) -> None:
+        self.warnings.append({"code": code, "message": message, "advice": advice})
+        if self._warn is not None:
+            self._warn(code, message, advice)
+
+
+class _Whole:
+    """Progress over several parts, each with a meter of its own."""
+
+    def __init__(self, report: Report) -> None:
+        self._report = report
+        self._start = time.monotonic()
+
+    def part(self, begin: float, share: float, note: str) -> Report:
+        """Where the meter of the part from ``begin`` on reports to."""
+
+        def report(step: Progress) -> None:
+            fraction = begin + share * step.fraction
+            elapsed = time.monotonic() - self._start
+            left = elapsed * (1 - fraction) / fraction if fraction > 0.02 else None
+            message = ": ".join(text for text in (note, step.message) if text)
+            self._report(Progress(step.stage, fraction, left, message))
+
+        return report
+
+
+def _fit_hand(
+    video: Path, found: Survey, hand: SurveyedHand, options: FitOptions, meter: ProgressMeter, notes: _Notes
+) -> FitOutcome:
+    clip = prepare_hand(video, found, hand, options, meter)
     meter.update("convert", 0.0)
     result = fit_hand(
         clip.views,
@@ -72,9 +152,15 @@ def fit(
             name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()
         },
         side=clip.model.side,
-        fov={"degrees": round(clip.camera.fov_degrees, 2), "assumed": clip.fov_assumed},
+        fov={
+            "degrees": round(clip.camera.fov_degrees, 2),
+            "source": clip.fov_source,
+            "assumed": clip.fov_source == "assumed",
+        },
         frames={
             "tracked": clip.tracked,
+            "not_trusted": clip.doubted,
+            "estimated": clip.estimated,
             "fitted": [view.index for view in clip.views if not view.heldout],
             "heldout": [view.index for view in clip.views if view.heldout],
             "choice": clip.choice.summary(),
@@ -94,7 +180,7 @@ def fit(
         seed=options.seed,
         versions=versions(),
         machine=machine(),
-        warnings=warnings,
+        warnings=list(notes.warnings),
     )
     return FitOutcome(result.avatar, summary, tracks, clip)
 
@@ -103,14 +189,41 @@ def fit_to_directory(
     video: Path,
     out: Path,
     options: FitOptions,
-    report: Callable[[Progress], None] | None = None,
+    report: Report | None = None,
     warn: Warn | None = None,
 ) -> FitReport:
     """:func:`fit`, with everything the command line promises written to ``out``."""
     out.mkdir(parents=True, exist_ok=True)
-    outcome = fit(video, options, report, warn)
+    return _write(fit(video, options, report, warn), out)
+
+
+def fit_hands_to_directory(
+    video: Path,
+    out: Path,
+    options: FitOptions,
+    report: Report | None = None,
+    warn: Warn | None = None,
+) -> HandsReport:
+    """:func:`fit_hands`, each hand written to a folder of its own, ``out/right`` and ``out/left``; ``out``
+    itself gets the report and the tracks of both."""
+    out.mkdir(parents=True, exist_ok=True)
+    for side in SIDES:
+        shutil.rmtree(out / side, ignore_errors=True)
+    reports, tracks = [], []
+    for outcome in fit_hands(video, options, report, warn):
+        folder = out / outcome.report.side
+        folder.mkdir()
+        reports.append(_write(outcome, folder))
+        tracks.append(outcome.tracks)
+    write_tracks(tracks, out / "tracks.json")
+    both = HandsReport.of(reports)
+    both.write(out)
+    return both
+
+
+def _write(outcome: FitOutcome, out: Path) -> FitReport:
     outcome.avatar.save(out)
-    write_tracks(outcome.tracks, out / "tracks.json")
+    write_tracks([outcome.tracks], out / "tracks.json")
     write_ply(outcome.avatar.cloud("rest"), out / "surfels.ply", "2dgs")
     _write_previews(outcome, out / "previews")
     outcome.report.write(out)

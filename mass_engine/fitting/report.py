@@ -7,12 +7,15 @@ import os
 import platform
 import resource
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 FILE_NAME = "report.json"
+#: Stages that both hands of a clip share.
+SHARED_STAGES = ("read", "track")
 _PACKAGES = ("mass-hand", "torch", "numpy", "opencv-contrib-python-headless", "av", "ai-edge-litert")
 
 
@@ -39,10 +42,7 @@ class FitReport:
 
     def write(self, directory: Path) -> None:
         """Write report.json in one step."""
-        target = directory / FILE_NAME
-        partial = target.with_name(FILE_NAME + ".partial")
-        partial.write_text(json.dumps(asdict(self), indent=2) + "\n")
-        os.replace(partial, target)
+        _write_json(asdict(self), directory)
 
     def summary(self) -> str:
         """A few lines for a person."""
@@ -56,6 +56,48 @@ class FitReport:
         for name, value in self.metrics.items():
             lines.append(f"  {kind} {name}: " + ("not computed" if value is None else f"{value:.3f}"))
         return "\n".join(lines)
+
+
+@dataclass
+class HandsReport:
+    """What a fit of both hands measured: the report of each by side, which also lies in the side's folder.
+
+    ``seconds`` of the whole, the shared passes counted once; ``warnings`` of either hand, each once.
+    """
+
+    hands: dict[str, FitReport]
+    seconds: dict[str, float]
+    peak_memory_bytes: int
+    warnings: list[dict[str, str]]
+
+    @staticmethod
+    def of(reports: Sequence[FitReport]) -> HandsReport:
+        """Put the reports of the hands of one clip together."""
+        seconds: dict[str, float] = {}
+        for number, report in enumerate(reports):
+            for name, value in report.seconds.items():
+                if number == 0 or name not in SHARED_STAGES:
+                    seconds[name] = round(seconds.get(name, 0.0) + value, 3)
+        warnings: list[dict[str, str]] = []
+        for report in reports:
+            warnings += [warning for warning in report.warnings if warning not in warnings]
+        peak = max(report.peak_memory_bytes for report in reports)
+        return HandsReport({report.side: report for report in reports}, seconds, peak, warnings)
+
+    def write(self, directory: Path) -> None:
+        """Write report.json in one step."""
+        _write_json(asdict(self), directory)
+
+    def summary(self) -> str:
+        """A few lines for a person."""
+        return "\n".join(report.summary() for report in self.hands.values())
+
+
+def _write_json(data: dict[str, Any], directory: Path) -> None:
+    target = directory / FILE_NAME
+    partial = target.with_name(FILE_NAME + ".partial")
+    partial.write_text(json.dumps(data, indent=2) + "\n")
+    os.replace(partial, target)
 
 
 def versions() -> dict[str, str]:

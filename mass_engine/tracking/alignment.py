@@ -7,7 +7,8 @@ directions, a weak depth cue.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,7 +41,7 @@ class AlignmentWeights:
     direction: float = 0.02  # world landmarks: bone directions
     direction_lead: float = 0.5  # more of it at the start, gone by half time
     limits: float = 1.0
-    rest: float = 2e-4  # pull of every finger angle towards the flat hand
+    rest: float = 2e-4  # pull of every finger angle towards the flat hand, or to the given start
     shape: float = 2e-4  # pull of every shape parameter towards the mean hand
     smooth: float = 0.3  # acceleration of the joints, hand sizes per (1/30 s)^2
     robust_scale: float = 0.03  # Charbonnier scale, in hand sizes
@@ -98,6 +99,18 @@ def initial_pose(model: HandModel, landmarks: Sequence[HandLandmarks], camera: C
     )
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Tensors of a few thousand numbers: a second thread only waits, on a busy machine for long."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@_one_thread()
 def align_landmarks(
     model: HandModel,
     landmarks: Sequence[HandLandmarks],
@@ -106,7 +119,7 @@ def align_landmarks(
     *,
     betas: Tensor | None = None,
     start: HandPose | None = None,
-    iterations: int = 400,
+    iterations: int = 200,
     weights: AlignmentWeights | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Alignment:
@@ -129,19 +142,21 @@ def align_landmarks(
 
     free_betas = torch.zeros(10) if betas is None else betas.clone()
     orient, fingers = begin.global_orient.clone(), begin.hand_pose.clone()
+    usual = begin.hand_pose  # flat, or as given
     depth0 = begin.transl[:, 2:].clamp_min(0.05)
     shift = torch.zeros_like(begin.transl)
     groups = [
-        {"params": [orient], "lr": 0.03},
-        {"params": [fingers], "lr": 0.03},
-        {"params": [shift], "lr": 0.01},
+        {"params": [orient], "lr": 0.09},
+        {"params": [fingers], "lr": 0.09},
+        {"params": [shift], "lr": 0.03},
     ]
     if betas is None:
-        groups.append({"params": [free_betas], "lr": 0.03})
+        groups.append({"params": [free_betas], "lr": 0.09})
     for group in groups:
         for parameter in group["params"]:  # type: ignore[attr-defined]
             parameter.requires_grad_(True)
-    optimizer = torch.optim.Adam(groups)
+    # A short memory of gradients: rates this high would not settle with the usual one.
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations, eta_min=1e-3)
     error = torch.zeros(len(landmarks))
 
@@ -152,8 +167,10 @@ def align_landmarks(
 
     for iteration in range(iterations):
         optimizer.zero_grad(set_to_none=True)
-        # Fingers bend only once the palm is in place: else they explain the palm's error.
-        finger_share = min(1.0, max(0.0, (iteration / iterations - 0.15) / 0.1))
+        # Fingers bend only once the palm is in place: else they explain the palm's error. A given start has
+        # them bent.
+        ramp = min(1.0, max(0.0, (iteration / iterations - 0.15) / 0.1))
+        finger_share = 1.0 if start is not None else ramp
         current = pose()
         if finger_share < 1.0:
             current = replace(current, hand_pose=fingers * finger_share)
@@ -168,7 +185,7 @@ def align_landmarks(
         loss = w.reprojection * (robust.mean(-1) * trust).mean()
         loss = loss + (w.direction + w.direction_lead * lead) * (cue.mean(-1) * trust).mean()
         loss = loss + w.limits * limit_excess(fingers, limits, frames).square().sum((-1, -2)).mean()
-        loss = loss + w.rest * fingers.square().sum(-1).mean() + w.shape * free_betas.square().sum()
+        loss = loss + w.rest * (fingers - usual).square().sum(-1).mean() + w.shape * free_betas.square().sum()
         behind = (0.05 - joints[..., 2]).clamp_min(0)
         loss = loss + 100 * behind.square().sum(-1).mean()
         if len(landmarks) > 2 and w.smooth > 0:

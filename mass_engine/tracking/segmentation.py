@@ -31,7 +31,7 @@ _EXPAND = 1.5  # window over the landmarks' bounding box
 _ROUNDS = 3
 _TIPS = slice(16, 21)  # the landmarks at the fingers' ends
 _CUFF = -50.0  # how far (mm, measured from the wrist) a sleeve may reach over the hand
-_WRIST, _TO_KNUCKLES = 58.0, -60.0  # mm from the forearm's axis and along it in which a wrist's edges lie
+_WRIST, _TO_KNUCKLES = 68.0, -60.0  # mm from the forearm's axis and along it in which a wrist's edges lie
 _MIXTURE_PIXELS = 20_000  # pixels of each side that the mixtures are made from
 _FEW = 50  # fewer pixels make no mixture
 

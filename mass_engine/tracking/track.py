@@ -1,4 +1,4 @@
-"""The main hand of a clip: which of the hands followed it is, its side, and which frames to trust.
+"""The main hand of a clip, or both of a person: which of the hands followed, their sides, frames to trust.
 
 Nothing here about a frame that is not held out depends on a frame that is.
 """
@@ -6,16 +6,18 @@ Nothing here about a frame that is not held out depends on a frame that is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mass_engine.errors import EngineError
 from mass_engine.hand.pose import Side
+from mass_engine.tracking.between import between
 from mass_engine.tracking.continuity import FlowRecorder, bridge
 from mass_engine.tracking.landmarks import BONES, HandLandmarks
 from mass_engine.tracking.models import HandNetworks
+from mass_engine.tracking.sides import SIDES, label_sides
 from mass_engine.tracking.tracker import HandTracker, TrackerOptions
 from mass_engine.video.reader import Frame
 
@@ -35,6 +37,7 @@ class Track:
     share of the vote that went to it; ``times`` in seconds of all frames read; ``heldout`` frame indices;
     ``width``, ``height`` of the frames in pixels; ``other_hands`` the most frames in which any one other
     hand was followed; ``same_side`` those in which another hand, surely of the same side, was seen beside it.
+    ``estimated``: held-out frames in which it was misread or lost, from their neighbours (:mod:`.between`).
     """
 
     side: Side
@@ -46,6 +49,7 @@ class Track:
     height: int
     other_hands: int
     same_side: int = 0
+    estimated: Mapping[int, HandLandmarks] = field(default_factory=dict)
 
     @property
     def missed(self) -> list[int]:
@@ -85,6 +89,10 @@ class TrackBuilder:
         """Choose the main hand. Raises EngineError ``video.no_hand`` or ``video.hand_too_small``."""
         return main_hand(self._found, self._times, self._heldout, *self._size, self._flow)
 
+    def finish_both(self) -> dict[Side, Track]:
+        """The right and the left hand, see :func:`both_hands`."""
+        return both_hands(self._found, self._times, self._heldout, *self._size, self._flow)
+
 
 def track_main_hand(
     frames: Iterable[Frame],
@@ -119,23 +127,98 @@ def main_hand(
     chosen = _choose(runs)
     hands = {i: h for track in chosen for i, h in runs[track].items()}
     _require_hand(hands, len(times) - len(held))
-    votes = np.array([hand.right for hand in hands.values()])
-    weights = np.array([hand.score for hand in hands.values()])
-    right = float((votes * weights).sum() / weights.sum())
-    side: Side = "right" if right >= 0.5 else "left"
-    if flow is not None:
-        hands = bridge(hands, flow)
-    doubted = _outliers(hands)
-    trusted = {i: h for i, h in hands.items() if i not in doubted}
-    marked = {i: replace(h, side=side, trusted=i not in doubted) for i, h in hands.items()}
-    for index in sorted(held & found.keys()):
-        picked = _pick(found[index], chosen, trusted)
-        if picked is not None:
-            marked[index] = replace(picked, side=side, trusted=_jump(picked, trusted) <= _JUMP)
     others = max((len(run) for track, run in runs.items() if track not in chosen), default=0)
     same = _same_side([run for track, run in runs.items() if track not in chosen], hands)
-    ordered = dict(sorted(marked.items()))
-    return Track(side, max(right, 1 - right), ordered, tuple(times), held, width, height, others, same)
+    right = _mean_right(hands)
+    side: Side = "right" if right >= 0.5 else "left"
+    hands, doubted = _put_right(hands, flow)
+    trusted = {i: h for i, h in hands.items() if i not in doubted}
+    marked = {i: replace(h, side=side, trusted=i not in doubted) for i, h in hands.items()}
+    read = {index: _pick(found[index], chosen, trusted) for index in sorted(held & found.keys())}
+    kept, estimated = _hold_out(read, marked, trusted)
+    return Track(
+        side, max(right, 1 - right), kept, tuple(times), held, width, height, others, same, estimated
+    )
+
+
+def both_hands(
+    found: Mapping[int, Sequence[HandLandmarks]],
+    times: Sequence[float],
+    heldout: Iterable[int],
+    width: int,
+    height: int,
+    flow: FlowRecorder | None = None,
+) -> dict[Side, Track]:
+    """The right and the left hand of one person, or only the one that is there; as :func:`main_hand`.
+
+    Raises EngineError ``video.no_hand`` or ``video.hand_too_small`` when neither can be used.
+    """
+    held = frozenset(heldout)
+    labelled = label_sides({i: seen for i, seen in found.items() if i not in held})
+    tracks: dict[Side, Track] = {}
+    errors: list[EngineError] = []
+    for side in SIDES:
+        hands = {i: pair[side] for i, pair in labelled.items() if side in pair}
+        try:
+            _require_hand(hands, len(times) - len(held))
+        except EngineError as error:
+            errors.append(error)
+            continue
+        right = _mean_right(hands)
+        hands, doubted = _put_right(hands, flow)
+        trusted = {i: h for i, h in hands.items() if i not in doubted}
+        marked = {i: replace(h, side=side, trusted=i not in doubted) for i, h in hands.items()}
+        read: dict[int, HandLandmarks | None] = {}
+        for index in sorted(held & found.keys()):
+            # A held-out frame is read from where the frame before left the tracker: its tracks are those.
+            before = max((i for i in labelled if i < index), default=None)
+            last = None if before is None else labelled[before].get(side)
+            read[index] = _pick(found[index], [] if last is None else [last.track], trusted)
+        kept, estimated = _hold_out(read, marked, trusted)
+        others = sum(side not in pair for pair in labelled.values())
+        certainty = right if side == "right" else 1 - right
+        tracks[side] = Track(
+            side, certainty, kept, tuple(times), held, width, height, others, estimated=estimated
+        )
+    if not tracks:
+        raise errors[0]
+    return tracks
+
+
+def _mean_right(hands: Mapping[int, HandLandmarks]) -> float:
+    """The vote on the side: the mean probability of a right hand, weighted by presence."""
+    votes = np.array([hand.right for hand in hands.values()])
+    weights = np.array([hand.score for hand in hands.values()])
+    return float((votes * weights).sum() / weights.sum())
+
+
+def _put_right(
+    hands: Mapping[int, HandLandmarks], flow: FlowRecorder | None
+) -> tuple[dict[int, HandLandmarks], set[int]]:
+    """``hands`` with short misreadings bridged, and the frames not to trust."""
+    if flow is None:
+        return dict(hands), _outliers(hands)
+    bridged, loose = bridge(hands, flow)
+    return bridged, _outliers(bridged) | loose
+
+
+def _hold_out(
+    read: Mapping[int, HandLandmarks | None],
+    hands: Mapping[int, HandLandmarks],
+    trusted: Mapping[int, HandLandmarks],
+) -> tuple[dict[int, HandLandmarks], dict[int, HandLandmarks]]:
+    """``hands`` with what was ``read`` in held-out frames, in order; and estimates where that is not to be
+    trusted, or nothing was read."""
+    kept, estimated = dict(hands), {}
+    side = next(iter(hands.values())).side
+    for index, hand in read.items():
+        good = hand is not None and _jump(hand, trusted) <= _JUMP
+        if hand is not None:
+            kept[index] = replace(hand, side=side, trusted=good)
+        guess = None if good else between(index, hand, hands, trusted)
+        if guess is not None:
+            estimated[index] = guess
+    return dict(sorted(kept.items())), estimated
 
 
 def _choose(runs: Mapping[int, Mapping[int, HandLandmarks]]) -> list[int]:

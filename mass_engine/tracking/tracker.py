@@ -58,13 +58,14 @@ class HandTracker:
         """Hands in one upright frame ``rgb`` uint8 [H,W,3], in the order they were first seen.
 
         With ``update=False`` the frame is read from the present state and leaves it as it was, so what is
-        found in any other frame does not depend on this one; a hand first seen here has ``track`` -1.
+        found in any other frame does not depend on this one; hands first seen here have negative tracks.
         """
         state, hands = self._step(rgb, index)
         if update:
             self._state = state
             return hands
-        return [replace(h, track=-1) if h.track >= self._state.next_track else h for h in hands]
+        known = self._state.next_track
+        return [h if h.track < known else replace(h, track=known - 1 - h.track) for h in hands]
 
     def _step(self, rgb: NDArray[np.uint8], index: int) -> tuple[_State, list[HandLandmarks]]:
         options, old = self._options, self._state

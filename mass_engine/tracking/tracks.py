@@ -27,7 +27,8 @@ class Tracks:
     metres, ``landmarks2d`` [F,21,2] pixels, ``scores`` [F]; ``K`` [3,3] for pictures of ``size`` (w, h).
 
     ``template`` names the hand that the poses, and above all ``betas``, are of. ``at_joints``: the
-    ``landmarks2d`` are joints of a hand model, not what a tracker saw in the picture.
+    ``landmarks2d`` are joints of a hand model, not what a tracker saw in the picture. ``rotations``: those
+    of ``pose`` are about a flat hand's, so that an alignment of any template can begin with them.
     """
 
     video: str
@@ -42,32 +43,36 @@ class Tracks:
     scores: list[float]
     template: str = "builtin"
     at_joints: bool = False
+    rotations: bool = True
 
 
-def write_tracks(tracks: Tracks, path: Path) -> None:
-    """Write tracks.json in one step."""
-    frames = []
-    for row, (index, time) in enumerate(zip(tracks.indices, tracks.times, strict=True)):
-        hand = {
-            "side": tracks.pose.side,
-            "betas": _rounded(tracks.pose.betas[row]),
-            "global_orient": _rounded(tracks.pose.global_orient[row]),
-            "hand_pose": _rounded(tracks.pose.hand_pose[row]),
-            "transl": _rounded(tracks.pose.transl[row]),
-            "joints3d": _rounded(tracks.joints3d[row]),
-            "landmarks2d": _rounded(tracks.landmarks2d[row], 3),
-            "score": round(tracks.scores[row], 4),
-        }
-        frames.append({"index": index, "time": round(time, 6), "hands": [hand]})
+def write_tracks(tracks: Sequence[Tracks], path: Path) -> None:
+    """Write the tracks of one or two hands of a clip, seen by one camera, as tracks.json in one step."""
+    frames: dict[int, dict[str, Any]] = {}
+    for one in tracks:
+        for row, (index, time) in enumerate(zip(one.indices, one.times, strict=True)):
+            hand = {
+                "side": one.pose.side,
+                "betas": _rounded(one.pose.betas[row]),
+                "global_orient": _rounded(one.pose.global_orient[row]),
+                "hand_pose": _rounded(one.pose.hand_pose[row]),
+                "transl": _rounded(one.pose.transl[row]),
+                "joints3d": _rounded(one.joints3d[row]),
+                "landmarks2d": _rounded(one.landmarks2d[row], 3),
+                "score": round(one.scores[row], 4),
+            }
+            frame = frames.setdefault(index, {"index": index, "time": round(time, 6), "hands": []})
+            frame["hands"].append(hand)
+    first = tracks[0]
     data = {
-        "video": tracks.video,
-        "fps": round(tracks.fps, 4),
-        "width": tracks.size[0],
-        "height": tracks.size[1],
-        "K": _rounded(tracks.K, 4),
-        "template": tracks.template,
-        "landmarks_at_joints": tracks.at_joints,
-        "frames": frames,
+        "video": first.video,
+        "fps": round(first.fps, 4),
+        "width": first.size[0],
+        "height": first.size[1],
+        "K": _rounded(first.K, 4),
+        "template": first.template,
+        "landmarks_at_joints": first.at_joints,
+        "frames": [frames[index] for index in sorted(frames)],
     }
     partial = path.with_name(path.name + ".partial")
     partial.write_text(json.dumps(data) + "\n")

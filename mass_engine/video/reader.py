@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mass_engine.errors import EngineError
 from mass_engine.video.color import to_rgb
 from mass_engine.video.container import corrupt, open_container, reason_of, too_many_pixels
+from mass_engine.video.focal_length import field_of_view
 from mass_engine.video.limits import VideoLimits
 from mass_engine.video.orientation import Orientation
 
@@ -38,8 +39,9 @@ class Frame:
 @dataclass(frozen=True)
 class VideoInfo:
     """What the container declares: upright ``width`` and ``height``, ``frames`` (None when not declared),
-    ``fps`` on average, ``duration`` in seconds (None when not declared), ``codec`` name, and the
-    ``rotation`` that makes it upright, in degrees clockwise (0, 90, 180, 270)."""
+    ``fps`` on average, ``duration`` in seconds (None when not declared), ``codec`` name, the ``rotation``
+    that makes it upright, in degrees clockwise (0, 90, 180, 270), and the field of view ``fov`` of the longer
+    side in degrees where the camera wrote its focal length."""
 
     width: int
     height: int
@@ -48,6 +50,7 @@ class VideoInfo:
     duration: float | None
     codec: str
     rotation: int
+    fov: float | None = None
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,8 @@ def probe(path: str | os.PathLike[str], limits: VideoLimits | None = None) -> Vi
         orientation = Orientation.of(first)
         height, width = orientation.size(*_square_size(first, stream))
         codec = stream.codec_context.name
-        return VideoInfo(width, height, frames, fps, duration, codec, orientation.degrees)
+        fov = field_of_view(container.metadata | stream.metadata, width, height)
+        return VideoInfo(width, height, frames, fps, duration, codec, orientation.degrees, fov)
 
 
 def read_frames(

@@ -24,6 +24,7 @@ def test_run_directory_holds_what_is_promised(draft_run: Path) -> None:
     assert not set(report["frames"]["heldout"]) & set(report["frames"]["fitted"])
     assert report["scored_frames"] == {"kind": "heldout", "count": len(report["frames"]["heldout"])}
     assert report["warnings"] == []
+    assert report["frames"]["not_trusted"] == []
     choice = report["frames"]["choice"]
     assert choice["chosen"]["index"] == report["frames"]["fitted"]
     left_out = sum(part["count"] for part in choice["left_out"].values())

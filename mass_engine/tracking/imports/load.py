@@ -3,7 +3,7 @@
 What other programs give is turned into points in the picture first (their joints through their camera). Then,
 when the template is the user's MANO, their parameters are kept as they are and only the translation is solved
 again, for the camera of this clip. On any other hand shape parameters mean nothing and a bone of the same
-rotation ends elsewhere: there the fit's own alignment starts from the points, as it does from the tracker's.
+rotation ends elsewhere: there the fit's own alignment to the points begins with the rotations of the file.
 """
 
 from __future__ import annotations
@@ -235,11 +235,8 @@ def _place(
         )
     track, points, pixels = track.rows(keep), points[keep], pixels[keep]
 
-    exact = (
-        template.mano is not None
-        and track.flat
-        and not any(n[0] == "tracks.parameters_differ" for n in notes)
-    )
+    rotations = track.flat and not any(n[0] == "tracks.parameters_differ" for n in notes)
+    exact = template.mano is not None and rotations
     carried = mano is None and track.flat and track.joints is None
     pose = track.pose()
     if exact:
@@ -272,6 +269,7 @@ def _place(
         pixels.astype(np.float32),
         track.scores.tolist(),
         template.name if exact or carried else "points only",
+        rotations=rotations,
     )
     return tracks, notes
 

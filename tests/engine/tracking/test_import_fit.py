@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from mass_engine.options import FitOptions
 from mass_engine.preprocess import prepare
 from mass_engine.progress import ProgressMeter
+from mass_engine.survey import survey
+from mass_engine.tracking.alignment import align_landmarks
 from mass_engine.tracking.imports.placing import project, solve_translation
 from mass_engine.tracking.tracks import read_tracks
 from tests.engine.hand.files import mano_arrays, write_mano
@@ -46,18 +48,23 @@ def test_a_fit_starts_from_wilor_s_poses(demo_clip: Path, draft_run: Path, tmp_p
     if kind == "mano":  # the built-in hand's own arrays in MANO's form
         template = f"mano:{write_mano(tmp_path / 'MANO_RIGHT.pkl', mano_arrays(1, vertices=None))}"
     warned: list[str] = []
-    clip = prepare(
-        demo_clip,
-        FitOptions(template=template, tracks=tmp_path / "wilor.npz", max_frames=8),
-        ProgressMeter(lambda _: None),
-        lambda code, *_: warned.append(code),
-    )
-    assert clip.fov_assumed
+    options = FitOptions(template=template, tracks=tmp_path / "wilor.npz", max_frames=8)
+    clip = prepare(demo_clip, options, ProgressMeter(lambda _: None), lambda code, *_: warned.append(code))
+    assert clip.fov_source == "assumed"
     expected = {"mano": [], "builtin": ["tracks.joints_only"], "rotations": ["tracks.rotations_only"]}
     assert warned == expected[kind]
     rows = [own.indices.index(view.index) for view in clip.views]
     if kind != "builtin":
         torch.testing.assert_close(clip.start.hand_pose, own.pose.hand_pose[rows], atol=1e-5, rtol=0)
+    if kind == "builtin":  # fitted to the file's joints, but from its rotations, not from a flat hand
+        found = survey(demo_clip, options, ProgressMeter(lambda _: None), lambda *_: None)
+        marks = [mark for mark in found.hands[0].marks if mark.index in {view.index for view in clip.views}]
+        times = [found.times[mark.index] for mark in marks]
+        scratch = align_landmarks(clip.model, marks, times, clip.camera).pose
+        off = [
+            float((pose.hand_pose - own.pose.hand_pose[rows]).abs().mean()) for pose in (clip.start, scratch)
+        ]
+        assert off[0] < 0.9 * off[1], off
     placed = clip.camera.project(clip.model.joints(clip.start)).numpy()
     size = (seen[rows].max(1) - seen[rows].min(1)).max(1)
     off = np.linalg.norm(placed - seen[rows], axis=-1).mean(1) / size

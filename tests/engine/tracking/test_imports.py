@@ -401,7 +401,7 @@ def test_our_own_tracks_for_another_camera(tmp_path: Path) -> None:
         made.pose, betas=0 * made.pose.betas, transl=made.pose.transl * 0.05 + torch.tensor([0.0, 0, 0.6])
     )
     made = replace(made, pose=pose, joints3d=model.joints(pose).numpy())
-    write_tracks(made, tmp_path / "tracks.json")
+    write_tracks([made], tmp_path / "tracks.json")
     same = load(f"tracks:{tmp_path / 'tracks.json'}")
     torch.testing.assert_close(same.tracks.pose.transl, pose.transl, atol=1e-5, rtol=0)
     assert same.camera_known

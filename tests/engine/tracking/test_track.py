@@ -102,6 +102,43 @@ def test_a_held_out_frame_takes_the_new_hand_only_where_the_main_one_should_be()
     assert 7 not in choose(found, 20, {7}).hands
 
 
+def test_a_held_out_frame_that_is_misread_or_lost_is_estimated_from_its_neighbours() -> None:
+    found = moving_hand(range(40))
+    expected = found[9][0].points
+    jumped = [replace(found[9][0], points=expected + np.float32(90))]
+    for there in (jumped, []):
+        result = choose(found | {9: there}, 40, {9})
+        assert list(result.estimated) == [9]
+        estimate = result.estimated[9]
+        np.testing.assert_allclose(estimate.points, expected, atol=1e-3)
+        assert estimate.score < 0.2
+        assert estimate.index == 9
+        assert 9 not in result.trusted
+        assert (9 in result.hands) == bool(there), "an estimate is no frame tracked"
+    np.testing.assert_array_equal(choose(found | {9: jumped}, 40, {9}).estimated[9].as_read, jumped[0].points)
+
+
+def test_a_held_out_frame_is_not_estimated_where_the_hand_may_be_gone() -> None:
+    """It is taken to be there for a few frames more, and through gaps of a second."""
+    away = moving_hand(range(20)) | {i: [] for i in range(20, 60)} | moving_hand(range(60, 80), track=1)
+    assert list(choose(away, 80, {7, 23, 31, 39, 57}).estimated) == [23, 57]
+    short = moving_hand(range(20)) | {i: [] for i in range(20, 45)} | moving_hand(range(45, 80), track=1)
+    assert list(choose(short, 80, {7, 23, 31, 39}).estimated) == [23, 31, 39]
+    ended = moving_hand(range(20)) | {i: [] for i in range(20, 40)}
+    assert list(choose(ended, 40, {23, 31}).estimated) == [23]
+
+
+def test_an_estimate_beyond_the_trusted_frames_has_their_pose_where_the_hand_was_read() -> None:
+    found = moving_hand(range(20))
+    last = found[18][0].points
+    far = found[19][0].points + np.array((0, 150), np.float32)
+    found[19] = [replace(found[19][0], points=far)]
+    estimate = choose(found, 20, {19}).estimated[19]
+    np.testing.assert_allclose(estimate.points - estimate.points[0], last - last[0], atol=1e-3)
+    np.testing.assert_allclose(estimate.points.mean(0), far.mean(0), atol=1e-2)
+    np.testing.assert_array_equal(estimate.as_read, far)
+
+
 @pytest.mark.parametrize(
     ("tracked", "frames", "fails"),
     [(4, 40, True), (5, 40, False), (3, 3, False), (11, 120, True), (12, 120, False), (30, 2000, False)],

@@ -29,7 +29,7 @@ def tracks() -> Tracks:
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     made = tracks()
-    write_tracks(made, tmp_path / "tracks.json")
+    write_tracks([made], tmp_path / "tracks.json")
     again = read_tracks(tmp_path / "tracks.json", "auto", (640, 480))
     assert again.indices == made.indices
     assert again.pose.side == "left"
@@ -63,7 +63,7 @@ def spoil(change: str) -> Any:
 )
 def test_incomplete_tracks_are_refused(tmp_path: Path, change: str) -> None:
     path = tmp_path / "tracks.json"
-    write_tracks(tracks(), path)
+    write_tracks([tracks()], path)
     data = json.loads(path.read_text())
     spoil(change)(data)
     path.write_text(json.dumps(data))
@@ -76,7 +76,7 @@ def test_tracks_of_another_size_side_or_no_file_are_named(tmp_path: Path) -> Non
     path = tmp_path / "tracks.json"
     with pytest.raises(EngineError, match=r"tracks\.not_found"):
         read_tracks(path, "auto", (640, 480))
-    write_tracks(tracks(), path)
+    write_tracks([tracks()], path)
     with pytest.raises(EngineError, match=r"tracks\.other_video"):
         read_tracks(path, "auto", (480, 640))
     with pytest.raises(EngineError, match=r"tracks\.no_hand"):

@@ -21,7 +21,7 @@ from mass_engine.fitting.subject import (
 from mass_engine.fitting.views import Level, View
 from mass_engine.raster import RasterOptions
 from mass_engine.surfel.binding import MeshBinding
-from mass_engine.surfel.shading import irradiance_basis
+from mass_engine.surfel.shading import irradiance_basis, white_light
 
 #: Opacity every surfel starts from: the hand is opaque.
 START_OPACITY = 0.95
@@ -86,12 +86,22 @@ class AppearanceFit:
         The gradient of ``sum(render * picture)`` with respect to the colours is, surfel by surfel, the sum
         of the picture under its blending weights: one backward pass gathers a whole frame.
         """
+        picked = torch.linspace(0, len(self._trained) - 1, min(count, len(self._trained))).round().long()
+        rows = [self._trained[int(place)] for place in picked.unique()]
+        return self._gather(light, side, rows, progress)
+
+    def colors_of(self, row: int) -> Tensor:
+        """Of one row: colour times weight, and weight, of every surfel [N,4], under white light."""
+        found = self._gather(white_light(), 640, [row], None)
+        return torch.cat([found.albedo * found.hand.unsqueeze(-1), found.hand.unsqueeze(-1)], -1)
+
+    def _gather(
+        self, light: Tensor, side: int, rows: list[int], progress: Callable[[float], None] | None
+    ) -> Evidence:
         size = self.binding.count
         hand, ignored, background = torch.zeros(size), torch.zeros(size), torch.zeros(size)
         numerator, denominator = torch.zeros(size, 3), torch.zeros(size, 3)
         opacities = torch.full((size,), START_OPACITY)
-        picked = torch.linspace(0, len(self._trained) - 1, min(count, len(self._trained))).round().long()
-        rows = [self._trained[int(place)] for place in picked.unique()]
         for done, row in enumerate(rows):
             level, surfels = self.views[row].level(side), self.surfels(row)
             colors = torch.zeros(size, 3, requires_grad=True)

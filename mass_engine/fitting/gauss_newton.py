@@ -22,7 +22,14 @@ from mass_engine.fitting.registration import (
     overlap,
     project_jacobian,
 )
-from mass_engine.fitting.subject import Appearance, PosedSurfels, Shape, mesh_edges, render_row, vertex_normals
+from mass_engine.fitting.subject import (
+    Appearance,
+    PosedSurfels,
+    Shape,
+    mesh_edges,
+    render_row,
+    vertex_normals,
+)
 from mass_engine.fitting.views import View
 from mass_engine.hand.builtin import joint_frames, joint_limits
 from mass_engine.hand.pose import HandPose
@@ -55,8 +62,7 @@ class Priors:
     betas: float = 1.0
     offset: float = 0.008  # of the personal surface
     offset_bend: float = 0.0012  # between neighbouring vertices
-    astray: float = 0.965  # a frame whose silhouettes overlap less has misplaced fingers: look far, too
-    frames: float = 1.0  # evidence of neighbouring frames errs together
+    astray: float = 0.955  # a frame whose silhouettes overlap less has misplaced fingers: look far, too
     landmark_knee: float = 0.08  # from here on a point's error counts linearly, hand sizes
 
 
@@ -113,7 +119,7 @@ class Registrar:
         targets = self._between(chosen)
         if not motion:
             targets[1].zero_()
-        count, vertices = len(self.shape.model.template), subdivision.n_vertices
+        vertices = subdivision.n_vertices
         systems: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]] = []
         blocks, sides = torch.zeros(vertices, 3, 3), torch.zeros(vertices, 3)
         pulls: list[float] = []
@@ -126,7 +132,9 @@ class Registrar:
             with torch.no_grad():
                 attached = binding.register(jacobian.vertices)
                 hand = self.shape.model.posed(pose, self.shape.displacement)
-            surfels = PosedSurfels(attached, jacobian.vertices, hand.bone_transforms[..., :3, :3], hand.joints)
+            surfels = PosedSurfels(
+                attached, jacobian.vertices, hand.bone_transforms[..., :3, :3], hand.joints
+            )
             for place, row in enumerate(part):
                 level = self.views[row].level(stage.side)
                 with torch.no_grad():
@@ -161,19 +169,23 @@ class Registrar:
         if shared and stage.betas:
             self.shape.betas += betas.clamp(-0.5, 0.5).float()
         if shared and stage.offsets:
-            self._move_surface(subdivision, blocks, sides, count)
+            self._move_surface(subdivision, blocks, sides)
         if lit:
             self.light = solve_light(lit, vertices)
         return sum(pulls) / max(len(pulls), 1)
 
-    def sweep(self, stages: Sequence[Round], binding: MeshBinding, gather: Gather, memory: float = 0.95) -> None:
+    def sweep(
+        self, stages: Sequence[Round], binding: MeshBinding, gather: Gather, memory: float = 0.95
+    ) -> None:
         """Register frame after frame, outward from the one that shows most, against the texture so far.
 
         A texture averaged over badly registered frames is flat and pulls nowhere; one that grows from a
         single frame is sharp from the start. A frame begins with its neighbour's correction.
         """
         trained = self._trained
-        key = max(range(len(trained)), key=lambda place: float((self.views[trained[place]].labels == 255).sum()))
+        key = max(
+            range(len(trained)), key=lambda place: float((self.views[trained[place]].labels == 255).sum())
+        )
         total = torch.zeros(binding.count, 4)
         moved: dict[int, Tensor] = {}
         for place in sorted(range(len(trained)), key=lambda place: abs(place - key)):
@@ -199,7 +211,10 @@ class Registrar:
     def _between(self, rows: list[int]) -> tuple[Tensor, Tensor]:
         """How each row would have to turn [B,51] to lie between its training neighbours, and how near
         these are [B] (1 at 30 frames a second, 0 at an end)."""
-        targets, near = torch.zeros(len(rows), POSE_SIZE, dtype=torch.float64), torch.zeros(len(rows), dtype=torch.float64)
+        targets, near = (
+            torch.zeros(len(rows), POSE_SIZE, dtype=torch.float64),
+            torch.zeros(len(rows), dtype=torch.float64),
+        )
         for place, row in enumerate(rows):
             earlier = [other for other in self._trained if other < row][-1:]
             later = [other for other in self._trained if other > row][:1]
@@ -227,7 +242,11 @@ class Registrar:
         """Steps [B,51] of the poses and [10] of the shape: the poses are eliminated first (Schur)."""
         p = self.priors
         motion = torch.cat(
-            [torch.full((3,), p.wrist_motion), torch.full((45,), p.finger_motion), torch.full((3,), p.shift_motion)]
+            [
+                torch.full((3,), p.wrist_motion),
+                torch.full((45,), p.finger_motion),
+                torch.full((3,), p.shift_motion),
+            ]
         ).double()
         damping = torch.cat([torch.full((48,), p.damping), torch.full((3,), p.shift_damping)]).double()
         pull, near = targets
@@ -241,21 +260,22 @@ class Registrar:
         cross = torch.stack([c for _, _, c, _, _ in systems])
         if cross.shape[1] == 0:
             return torch.linalg.solve(own, side.unsqueeze(-1)).squeeze(-1), torch.zeros(0)
-        k = p.frames
-        shape = k * torch.stack([d for *_, d, _ in systems]).sum(0)
-        shape_side = k * torch.stack([e for *_, e in systems]).sum(0)
+        shape = torch.stack([d for *_, d, _ in systems]).sum(0)
+        shape_side = torch.stack([e for *_, e in systems]).sum(0)
         shape = shape + torch.eye(10).double() * (p.betas**-2 + 0.3**-2)
         shape_side = shape_side - self.shape.betas.double() * p.betas**-2
         solved = torch.linalg.solve(own, torch.cat([cross.mT, side.unsqueeze(-1)], -1))
-        reduced = shape - k * (cross @ solved[..., :-1]).sum(0)
-        reduced_side = shape_side - k * (cross @ solved[..., -1:]).sum(0).squeeze(-1)
+        reduced = shape - (cross @ solved[..., :-1]).sum(0)
+        reduced_side = shape_side - (cross @ solved[..., -1:]).sum(0).squeeze(-1)
         betas = torch.linalg.solve(reduced, reduced_side)
         return solved[..., -1] - solved[..., :-1] @ betas, betas
 
     def _limit_terms(self, rows: list[int]) -> tuple[Tensor, Tensor]:
         """Quadratic walls beyond the joint limits."""
         index = torch.tensor(rows)
-        angles = torch.einsum("jab,rjb->rja", self._axes, self.table.values["hand_pose"][index].double().unflatten(1, (15, 3)))
+        angles = torch.einsum(
+            "jab,rjb->rja", self._axes, self.table.values["hand_pose"][index].double().unflatten(1, (15, 3))
+        )
         low, high = self._limits[..., 0] - angles, angles - self._limits[..., 1]
         beyond = torch.where(low > 0, low, torch.where(high > 0, -high, torch.zeros_like(low)))
         strength = (beyond != 0).double() / self.priors.limit**2
@@ -290,10 +310,14 @@ class Registrar:
         apart = ((self._points[index] - here) / self._sizes[index].view(-1, 1, 1)).double()
         length = apart.norm(dim=-1).clamp_min(1e-9)
         scores = torch.tensor([self.views[row].score for row in rows], dtype=torch.float64)
-        weight = scores[:, None] * torch.where(length < p.landmark_knee, 1.0, p.landmark_knee / length) / sigma**2
+        weight = (
+            scores[:, None] * torch.where(length < p.landmark_knee, 1.0, p.landmark_knee / length) / sigma**2
+        )
         weighted = jacobian * weight[..., None, None]
         flat = jacobian.flatten(1, 2)
-        return flat.mT @ weighted.flatten(1, 2), (weighted.flatten(1, 2).mT @ apart.flatten(1, 2).unsqueeze(-1)).squeeze(-1)
+        return flat.mT @ weighted.flatten(1, 2), (
+            weighted.flatten(1, 2).mT @ apart.flatten(1, 2).unsqueeze(-1)
+        ).squeeze(-1)
 
     def _move(self, rows: list[int], steps: Tensor) -> None:
         limited = steps.float()
@@ -303,10 +327,10 @@ class Registrar:
         index = torch.tensor(rows)[good]
         self.table.put(index, turned(self._poses(index.tolist()), limited[good]))
 
-    def _move_surface(self, subdivision: Subdivision, blocks: Tensor, sides: Tensor, count: int) -> None:
-        """The rest surface's offsets [V,3]: evidence of all frames against smoothness, by conjugate gradients."""
+    def _move_surface(self, subdivision: Subdivision, blocks: Tensor, sides: Tensor) -> None:
+        """The rest surface's offsets [V,3]: all frames' evidence against smoothness."""
         p = self.priors
-        k = p.frames * p.trust
+        k = p.trust
         edges = self._edges
 
         def smooth(d: Tensor) -> Tensor:
@@ -314,13 +338,12 @@ class Registrar:
             total = d / p.offset**2
             return total.index_add(0, edges[:, 0], between).index_add(0, edges[:, 1], -between)
 
-        def transpose(values: Tensor) -> Tensor:
-            return values if subdivision._transpose is None else subdivision._transpose @ values
-
         def apply(d: Tensor) -> Tensor:
-            return k * transpose((blocks @ subdivision.apply(d).unsqueeze(-1)).squeeze(-1)) + smooth(d)
+            return k * subdivision.gather((blocks @ subdivision.apply(d).unsqueeze(-1)).squeeze(-1)) + smooth(
+                d
+            )
 
-        right = k * transpose(sides) - smooth(self.shape.displacement)
+        right = k * subdivision.gather(sides) - smooth(self.shape.displacement)
         step = conjugate_gradients(apply, right, 60)
         self.shape.displacement += step.clamp(-0.003, 0.003)
 
@@ -337,7 +360,9 @@ def difference(before: HandPose, after: HandPose) -> Tensor:
 
 def plain(binding: MeshBinding, albedo: Tensor) -> Appearance:
     """Opaque surfels of one colour from everywhere."""
-    return Appearance(albedo, torch.full((binding.count,), 3.0), torch.zeros(binding.count, 0, 3), white_light())
+    return Appearance(
+        albedo, torch.full((binding.count,), 3.0), torch.zeros(binding.count, 0, 3), white_light()
+    )
 
 
 def conjugate_gradients(apply: Callable[[Tensor], Tensor], right: Tensor, iterations: int) -> Tensor:

@@ -53,7 +53,7 @@ def pose_jacobian(shape: Shape, subdivision: Subdivision, pose: HandPose) -> Pos
         transforms = posed.bone_transforms
         turns, places = transforms[..., :3, :3], posed.joints[:, :16]
         blended = torch.einsum("vj,bjac->bvac", model.weights, turns)
-        # A vertex is sum_k w_k (turn_k x + shift_k); x is found back from the posed vertex, correctives included.
+        # A vertex is sum_k w_k (turn_k x + shift_k): x is found back from it, correctives included.
         shift = torch.einsum("vj,bja->bva", model.weights, transforms[..., :3, 3])
         rest = torch.linalg.solve(blended, (posed.vertices - shift).unsqueeze(-1)).squeeze(-1)
         each = torch.einsum("bjac,bvc->bvja", turns, rest) + transforms[:, None, :, :3, 3]
@@ -68,7 +68,10 @@ def pose_jacobian(shape: Shape, subdivision: Subdivision, pose: HandPose) -> Pos
         parents = turns[:, [max(parent, 0) for parent in JOINT_PARENTS]].clone()
         parents[:, 0] = torch.eye(3)
     return PoseJacobian(
-        refined[..., :3], refined[..., 3:51].unflatten(-1, (16, 3)), parents, refined[..., 51:].unflatten(-1, (3, 3))
+        refined[..., :3],
+        refined[..., 3:51].unflatten(-1, (16, 3)),
+        parents,
+        refined[..., 51:].unflatten(-1, (3, 3)),
     )
 
 
@@ -92,9 +95,7 @@ def turned(pose: HandPose, step: Tensor) -> HandPose:
     vectors = torch.cat([pose.global_orient, pose.hand_pose], -1).unflatten(-1, (16, 3))
     small = step[:, :48].unflatten(-1, (16, 3))
     new = matrix_to_axis_angle(axis_angle_to_matrix(small) @ axis_angle_to_matrix(vectors))
-    return HandPose(
-        pose.betas, new[:, 0], new[:, 1:].flatten(1), pose.transl + step[:, 48:], pose.side
-    )
+    return HandPose(pose.betas, new[:, 0], new[:, 1:].flatten(1), pose.transl + step[:, 48:], pose.side)
 
 
 def _descendants() -> Tensor:

@@ -45,7 +45,9 @@ def solve_light(samples: Sequence[LightSample], count: int, rounds: int = 8, rid
             rows = basis * albedo[:, channel : channel + 1]
             matrix = (rows.T * weight) @ rows
             hold = ridge * float(matrix[0, 0]) * torch.eye(9)
-            columns.append(torch.linalg.solve(matrix + hold, (rows.T * weight) @ color[:, channel] + hold[0] * 1.0))
+            columns.append(
+                torch.linalg.solve(matrix + hold, (rows.T * weight) @ color[:, channel] + hold[0] * 1.0)
+            )
         light = torch.stack(columns, -1)
         light = light / light[:1].clamp_min(1e-3)
         error = (albedo * (basis @ light) - color).abs().mean(-1)
@@ -54,7 +56,7 @@ def solve_light(samples: Sequence[LightSample], count: int, rounds: int = 8, rid
 
 
 def sample_colors(rgb: Tensor, usable: Tensor, pixels: Tensor, normals: Tensor, seen: Tensor) -> LightSample:
-    """Colours of the ``seen`` [V] vertices at ``pixels`` [V,2] of a picture [h,w,3], where ``usable`` [h,w]."""
+    """Colours of ``seen`` [V] vertices at ``pixels`` [V,2] of a picture [h,w,3], where ``usable`` [h,w]."""
     at = (pixels - 0.5).numpy().astype(np.float32)
     inside = cv2.remap(usable.numpy(), at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)[:, 0] > 0.99
     colors = cv2.remap(rgb.numpy(), at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)[:, 0]

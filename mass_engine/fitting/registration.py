@@ -8,7 +8,6 @@ render gives a whole linear system for the pose, where gradient descent needs hu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mass_engine.fitting.kinematics import POSE_SIZE, PoseJacobian
 from mass_engine.fitting.views import Level
 from mass_engine.raster import RenderOutput
 
@@ -55,7 +53,12 @@ class Evidence2D:
 
 
 def observe(
-    level: Level, out: RenderOutput, vertices: Tensor, normals: Tensor, weights: RegistrationWeights, texture: bool
+    level: Level,
+    out: RenderOutput,
+    vertices: Tensor,
+    normals: Tensor,
+    weights: RegistrationWeights,
+    texture: bool,
 ) -> Evidence2D:
     """What one frame says of the ``vertices`` [V,3] (world, with outward ``normals``) drawn as ``out``."""
     camera = level.camera
@@ -95,12 +98,14 @@ def _rim(
     if len(picked) == 0:
         return
     at = xy[picked]
-    smooth_here, smooth_there = (cv2.GaussianBlur(d, (0, 0), 1.5) for d in (here, there))
+    smooth_here, smooth_there = _smooth(here), _smooth(there)
     n, m = _direction(smooth_there, at), _direction(smooth_here, at)
     apart = inner[picked] - _sample(there, at) - weights.rim_bias
     agree = (n * m).sum(-1)
     good = (agree > 0.5) & (np.abs(apart) < weights.rim_reach)
-    weight = agree * np.where(np.abs(apart) < weights.huber, 1.0, weights.huber / np.maximum(np.abs(apart), 1e-3))
+    weight = agree * np.where(
+        np.abs(apart) < weights.huber, 1.0, weights.huber / np.maximum(np.abs(apart), 1e-3)
+    )
     weight *= good / weights.rim**2
     # Each pixel of the outline counts once, however many vertices are near it.
     length = float(((alpha > 0.5) & (np.abs(here) < 1.0) & (free > 0.5)).sum())
@@ -119,13 +124,15 @@ def _texture(
     gradient: Image,
 ) -> None:
     """The Lucas-Kanade step of every visible vertex's surroundings."""
-    inside = ((out.alpha.numpy() > 0.95) & (level.hand.numpy() > 0.95) & (level.colored.numpy() > 0.95)).astype(np.float32)
-    inside = cv2.erode(inside, np.ones((3, 3), np.uint8))
+    inside = (
+        (out.alpha.numpy() > 0.95) & (level.hand.numpy() > 0.95) & (level.colored.numpy() > 0.95)
+    ).astype(np.float32)
+    inside = np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)), np.float32)
     if inside.sum() < 50:
         return
     real = _high_pass(level.rgb.mean(-1).numpy(), inside, weights.high_pass)
     drawn = _high_pass(out.rgb.mean(-1).numpy(), inside, weights.high_pass)
-    core = cv2.erode(inside, np.ones((3, 3), np.uint8))
+    core = np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)), np.float32)
     both = 0.5 * (real + drawn)
     gx = cv2.Sobel(both, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     gy = cv2.Sobel(both, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
@@ -134,17 +141,21 @@ def _texture(
     planes = np.stack(
         [weight * gx * gx, weight * gx * gy, weight * gy * gy, weight * gx * apart, weight * gy * apart], -1
     )
-    planes = cv2.boxFilter(np.ascontiguousarray(planes[..., :4]), -1, (9, 9)), cv2.boxFilter(planes[..., 4], -1, (9, 9))
+    # OpenCV samples up to four channels at a time.
+    first = np.asarray(cv2.boxFilter(np.ascontiguousarray(planes[..., :4]), -1, (9, 9)), np.float32)
+    last = np.asarray(cv2.boxFilter(planes[..., 4], -1, (9, 9)), np.float32)
     picked = np.nonzero(seen & (_sample(core, xy) > 0.5))[0]
     if len(picked) == 0:
         return
     share = float(core.sum()) / len(picked)
-    first, last = _sample(planes[0], xy[picked]), _sample(planes[1], xy[picked])
-    hessian[picked] += share * first[:, :3]
-    gradient[picked] += share * np.stack([first[:, 3], last], -1)
+    here, there = _sample(first, xy[picked]), _sample(last, xy[picked])
+    hessian[picked] += share * here[:, :3]
+    gradient[picked] += share * np.stack([here[:, 3], there], -1)
 
 
-def observe_far(level: Level, alpha: Tensor, pixels: Tensor, weights: RegistrationWeights) -> tuple[Tensor, Tensor]:
+def observe_far(
+    level: Level, alpha: Tensor, pixels: Tensor, weights: RegistrationWeights
+) -> tuple[Tensor, Tensor]:
     """What lies far off, for a pose only: ``hessian`` [V,3] and ``gradient`` [V,2] as in Evidence2D.
 
     Outline of the mask that the render stays away from draws its nearest vertex, seen or not; vertices out
@@ -160,13 +171,15 @@ def observe_far(level: Level, alpha: Tensor, pixels: Tensor, weights: Registrati
         points = np.stack([columns, rows], -1)[::every].astype(np.float32)
         nearest = np.square(points[:, None] - xy[None]).sum(-1).argmin(1)
         apart = points - xy[nearest]
-        weight = every * weights.huber / np.maximum(np.linalg.norm(apart, axis=-1), weights.huber) / weights.rim**2
+        weight = (
+            every * weights.huber / np.maximum(np.linalg.norm(apart, axis=-1), weights.huber) / weights.rim**2
+        )
         np.add.at(hessian, nearest, weight[:, None] * np.array([1.0, 0.0, 1.0], np.float32))
         np.add.at(gradient, nearest, weight[:, None] * apart)
     out = -_sample(there, xy)
     lost = np.nonzero((out > weights.huber) & (_sample(free, xy) > 0.9))[0]
     if len(lost) > 0:
-        n = _direction(cv2.GaussianBlur(there, (0, 0), 1.5), xy[lost])
+        n = _direction(_smooth(there), xy[lost])
         size = float((level.hand > 0.5).sum()) / len(xy)  # pixels a vertex stands for
         weight = size * weights.huber / out[lost] / weights.rim**2
         hessian[lost] += weight[:, None] * np.stack([n[:, 0] ** 2, n[:, 0] * n[:, 1], n[:, 1] ** 2], -1)
@@ -190,7 +203,8 @@ def project_jacobian(level: Level, vertices: Tensor) -> Tensor:
     rows[:, 0, 0] = 1 / z
     rows[:, 1, 1] = 1 / z
     rows[:, :, 2] = -at[:, :2] / (z * z).unsqueeze(-1)
-    return camera.K[:2, :2] @ rows @ rotation
+    jacobian: Tensor = camera.K[:2, :2] @ rows @ rotation
+    return jacobian
 
 
 def normal_equations(hessian: Tensor, gradient: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
@@ -205,7 +219,7 @@ def normal_equations(hessian: Tensor, gradient: Tensor, jacobian: Tensor) -> tup
 def matrices(hessian: Tensor) -> Tensor:
     """[V,3] (xx, xy, yy) as [V,2,2]."""
     xx, xy, yy = hessian.unbind(-1)
-    return torch.stack([xx, xy, xy, yy], -1).unflatten(-1, (2, 2))
+    return torch.stack([xx, xy, xy, yy], -1).view(-1, 2, 2)
 
 
 def signed_distance(coverage: Image) -> Image:
@@ -214,7 +228,9 @@ def signed_distance(coverage: Image) -> Image:
     far = float(sum(coverage.shape))
     if inside.min() == inside.max():
         return np.full(coverage.shape, far if inside.max() else -far, np.float32)
-    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
+    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(
+        1 - inside, cv2.DIST_L2, 5
+    )
     # A pixel next to the outline is half a pixel from it on average, not one.
     return np.asarray(distance - 0.5 * np.sign(distance), np.float32)
 
@@ -234,6 +250,11 @@ def _high_pass(grey: Image, inside: Image, sigma: float) -> Image:
     return np.asarray(cv2.GaussianBlur((grey - blurred) * inside, (0, 0), 0.8), np.float32)
 
 
+def _smooth(distance: Image) -> Image:
+    """A distance map whose gradient does not follow every pixel's corner."""
+    return np.asarray(cv2.GaussianBlur(distance, (0, 0), 1.5), np.float32)
+
+
 def _sample(image: Image, xy: Image, how: int = cv2.INTER_LINEAR) -> Image:
     """Values at points [P,2] (pixel centres at whole numbers); 0 outside."""
     columns = cv2.remap(image, xy[:, None, 0], xy[:, None, 1], how, borderMode=cv2.BORDER_CONSTANT)
@@ -245,4 +266,6 @@ def _direction(distance: Image, xy: Image) -> Image:
     step = np.array([[1.0, 0.0], [0.0, 1.0]], np.float32)
     rows = [_sample(distance, xy + s) - _sample(distance, xy - s) for s in step]
     gradient = np.stack(rows, -1)
-    return np.asarray(gradient / np.maximum(np.linalg.norm(gradient, axis=-1, keepdims=True), 1e-6), np.float32)
+    return np.asarray(
+        gradient / np.maximum(np.linalg.norm(gradient, axis=-1, keepdims=True), 1e-6), np.float32
+    )

@@ -11,8 +11,10 @@ from torch import Tensor
 from mass_engine.avatar import Avatar, SourceFrames
 from mass_engine.camera import Camera
 from mass_engine.fitting.appearance import START_OPACITY, AppearanceFit, AppearancePass, Evidence, fill_unseen
+from mass_engine.fitting.gauss_newton import Registrar, Round
 from mass_engine.fitting.geometry import GeometryFit, GeometryPass, GeometryWeights
 from mass_engine.fitting.poses import PoseTable
+from mass_engine.fitting.registration import RegistrationWeights
 from mass_engine.fitting.subject import Appearance, Shape
 from mass_engine.fitting.views import View
 from mass_engine.hand.model import HandModel
@@ -24,8 +26,15 @@ from mass_engine.tracking.alignment import interpolate_pose
 
 #: How far into the hand from its wrist joint it may be cut, metres at the mean size.
 WRIST_REACH = 0.03
-#: What a pixel of forearm counts against one of hand when the wrist is cut: better a little too long.
-FOREARM_WEIGHT = 0.2
+#: What a pixel of background, and of forearm, counts against one of hand when the wrist is cut. A sleeve
+#: that slides shows in one frame what it hides in another: the hand ends where it was never seen.
+BACKGROUND_WEIGHT, FOREARM_WEIGHT = 0.2, 0.004
+#: How far the surface stands over the mask's outline, pixels: a hole shows the background, a rim only skin.
+RIM_BIAS = 0.4
+#: Frames whose mean texture the others are registered against.
+REGISTRATION_FRAMES = 100
+#: The steps of every frame in the sweep.
+SWEEP = tuple(Round(side, betas=False, offsets=False) for side in (160, 320, 640))
 
 
 @dataclass(frozen=True)
@@ -33,15 +42,19 @@ class Schedule:
     """How much work a preset does.
 
     ``levels`` and ``depth`` are the Loop levels and fractal depth of the final surfels; ``harmonics`` is the
-    number of view-dependent coefficients a colour channel has (0, 3, 8, 15).
+    number of view-dependent coefficients a colour channel has (0, 3, 8, 15). Stage one is ``geometry`` (by
+    gradient, from afar), ``outline`` (registration without texture), then, if there is any ``texture``, a
+    sweep over the frames and registration with it.
     """
 
     levels: int
     depth: int
     harmonics: int
     geometry: tuple[GeometryPass, ...]
+    outline: tuple[Round, ...]
+    texture: tuple[Round, ...]
     appearance: tuple[AppearancePass, ...]
-    heldout: tuple[GeometryPass, ...]
+    heldout: tuple[Round, ...]
     gather_frames: int
     gather_side: int
 
@@ -50,27 +63,33 @@ def schedule_for(preset: str) -> Schedule:
     """The schedule of a preset (draft, auto, full)."""
     rough = GeometryWeights(landmarks=1.0, outline=20.0, limits=1.0)
     middle = GeometryWeights(landmarks=0.1, outline=20.0)
-    fine = GeometryWeights(landmarks=0.02, outline=10.0)
     first = GeometryPass(96, 10, rate=2.0, color=False, weights=rough)
-    heldout = (
-        replace(first, visits=20, levels=1, depth=0, rate=1.0, shared=False, weights=middle),
-        GeometryPass(256, 16, levels=1, rate=0.5, color=False, shared=False, weights=fine),
-    )
+    second = GeometryPass(160, 14, levels=1, depth=0, rate=1.5, weights=middle)
+    # Surface and shape answer to the same evidence: one at a time, or they overshoot together.
+    pose = Round(160, texture=False, betas=False, offsets=False)
+    surface = replace(pose, offsets=True)
+    standing = RegistrationWeights(rim_bias=RIM_BIAS)
+    heldout = (replace(pose, side=320), *(replace(pose, side=640, weights=standing),) * 2)
     if preset == "draft":
-        geometry: tuple[GeometryPass, ...] = (
-            replace(first, visits=8),
-            GeometryPass(160, 8, levels=1, depth=0, rate=1.5, weights=middle),
+        return Schedule(
+            1,
+            0,
+            0,
+            (replace(first, visits=8), replace(second, visits=8)),
+            (pose, surface, replace(surface, side=256, weights=standing)),
+            (),
+            (AppearancePass(256, 2),),
+            heldout,
+            40,
+            256,
         )
-        return Schedule(1, 0, 0, geometry, (AppearancePass(256, 2),), heldout, 40, 256)
-    geometry = (
-        first,
-        GeometryPass(160, 14, levels=1, depth=0, rate=1.5, weights=middle),
-        *(GeometryPass(320, visits, levels=1, depth=1, rate=0.8, weights=fine) for visits in (14, 8)),
-    )
+    pair = (Round(320, offsets=False), Round(320, betas=False))
+    texture = (*pair * 3, *(Round(640, weights=standing),) * 5)
     appearance = (AppearancePass(320, 2), AppearancePass(640, 3, rate=0.7, view_dependent=True))
+    outline = (*(pose,) * 4, *(surface,) * 2)
     if preset == "auto":
-        return Schedule(1, 1, 3, geometry, appearance, heldout, 60, 640)
-    return Schedule(2, 1, 8, geometry, appearance, heldout, 100, 640)
+        return Schedule(1, 1, 3, (first, second), outline, texture, appearance, heldout, 60, 640)
+    return Schedule(2, 1, 8, (first, second), outline, texture, appearance, heldout, 100, 640)
 
 
 @dataclass(frozen=True)
@@ -118,16 +137,18 @@ def fit_hand(
             bindings[levels, depth] = MeshBinding.build(model, levels, depth)
         return bindings[levels, depth]
 
-    light = white_light()
     for stage, share in zip(schedule.geometry, shares.geometry, strict=True):
         coarse = bind(stage.levels, stage.depth)
-        look = _plain(coarse, light)
+        look = _plain(coarse, white_light())
         if stage.color:
             gatherer = AppearanceFit(views, table, shape, coarse, seed, raster)
-            look.albedo = fill_unseen(gatherer.gather(light, stage.side, 40), coarse, 0.5)
+            look.albedo = fill_unseen(gatherer.gather(look.light, stage.side, 40), coarse, 0.5)
         geometry.run(stage, coarse, look, progress=part(share, f"stage 1 at {stage.side} px"))
-        light = look.light
         done += share
+    registrar = Registrar(views, table, shape, camera, raster)
+    _register(registrar, schedule, bind, seed, part(shares.registration, "stage 1, registration"))
+    done += shares.registration
+    light = registrar.light
 
     binding = bind(schedule.levels, schedule.depth)
     second = AppearanceFit(views, table, shape, binding, seed, raster)
@@ -139,11 +160,11 @@ def fit_hand(
         done += share
 
     _place_heldout(views, table, start)
-    heldout = torch.tensor([row for row, view in enumerate(views) if view.heldout], dtype=torch.long)
-    if len(heldout) > 0:
-        for stage in schedule.heldout:
-            outline = bind(stage.levels, stage.depth)
-            geometry.run(stage, outline, _plain(outline, light), heldout)
+    heldout = [row for row, view in enumerate(views) if view.heldout]
+    if heldout:
+        outline = bind(1, 0)
+        for turn in schedule.heldout:
+            registrar.step(turn, outline, _plain(outline, light), heldout)
 
     kept = _keep(evidence, binding, model)
     avatar = Avatar(
@@ -171,18 +192,48 @@ def fit_hand(
     )
 
 
+def _register(
+    registrar: Registrar,
+    schedule: Schedule,
+    bind: Callable[[int, int], MeshBinding],
+    seed: int,
+    progress: Callable[[float], None],
+) -> None:
+    """Registration by outline, then, when texture takes part, a sweep and registration with it."""
+    total = len(schedule.outline) + 2 * len(schedule.texture) + 4
+    fit = registrar
+    coarse = bind(1, 0)
+    for done, turn in enumerate(schedule.outline):
+        fit.step(turn, coarse, _plain(coarse, fit.light))
+        progress((done + 1) / total)
+    if not schedule.texture:
+        return
+    fine = bind(1, 1)
+    gatherer = AppearanceFit(fit.views, fit.table, fit.shape, fine, seed, fit.raster)
+    fit.sweep(SWEEP, fine, gatherer.colors_of)
+    for done, turn in enumerate(schedule.texture):
+        progress((len(schedule.outline) + 4 + 2 * done) / total)
+        look = _plain(fine, fit.light)
+        look.albedo = fill_unseen(gatherer.gather(fit.light, turn.side, REGISTRATION_FRAMES), fine, 0.5)
+        fit.step(turn, fine, look)
+
+
 @dataclass(frozen=True)
 class _Shares:
     geometry: list[float]
+    registration: float
     appearance: list[float]
 
 
 def _shares(schedule: Schedule) -> _Shares:
     """How the time divides over the passes: by pixels and visits, with a constant part a step."""
     first = [stage.visits * (60.0**2 + stage.side**2) for stage in schedule.geometry]
+    turns = [3.0 * (60.0**2 + turn.side**2) for turn in (*schedule.outline, *schedule.texture)]
     second = [stage.visits * 2 * (60.0**2 + stage.side**2) for stage in schedule.appearance]
-    total = sum(first) + sum(second)
-    return _Shares([value / total for value in first], [value / total for value in second])
+    total = sum(first) + sum(turns) + sum(second)
+    return _Shares(
+        [value / total for value in first], sum(turns) / total, [value / total for value in second]
+    )
 
 
 def _plain(binding: MeshBinding, light: Tensor, harmonics: int = 0) -> Appearance:
@@ -211,7 +262,7 @@ def _keep(evidence: Evidence, binding: MeshBinding, model: HandModel) -> Tensor:
     along = along if model.side == "right" else -along  # the forearm's axis, outward
     wrist = along > -WRIST_REACH
     hand = evidence.hand[wrist]
-    other = (FOREARM_WEIGHT * (0.02 * evidence.ignored + evidence.background))[wrist]
+    other = (FOREARM_WEIGHT * evidence.ignored + BACKGROUND_WEIGHT * evidence.background)[wrist]
     if float(other.sum()) < 0.01 * float(hand.sum()):
         return torch.arange(binding.count)
     centered = (places[wrist] - places[wrist].mean(0)) / (2 * WRIST_REACH)

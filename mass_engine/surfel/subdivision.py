@@ -33,6 +33,10 @@ class Subdivision:
         product = fixed_product(self._matrix, self._transpose, columns)
         return product.reshape(self.n_vertices, -1, channels).movedim(0, 1).reshape(*lead, -1, channels)
 
+    def gather(self, values: Tensor) -> Tensor:
+        """The transposed map: values [V',C] of the refined mesh summed onto the base vertices [V,C]."""
+        return values if self._transpose is None else torch.mm(self._transpose, values)
+
 
 def loop_subdivision(faces: Tensor, n_vertices: int, levels: int) -> Subdivision:
     """The operator of ``levels`` (0 to 3) Loop steps on a mesh of ``faces`` [F,3]; boundaries are creases."""

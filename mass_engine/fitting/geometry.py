@@ -1,6 +1,6 @@
-"""Stage one: poses, shape and personal surface, with low-frequency colour, coarse to fine.
+"""The beginning of stage one: poses, shape and personal surface by gradient descent, from afar.
 
-The same loop refines the poses of held-out frames: then everything shared is frozen and colour is off.
+Slow but far-sighted: outline and landmarks pull from any distance. ``gauss_newton`` takes over from here.
 """
 
 from __future__ import annotations
@@ -57,7 +57,6 @@ class GeometryPass:
     rate: float = 1.0
     batch: int = 4
     color: bool = True
-    shared: bool = True  # shape, displacement and colour move too, not only the poses
     weights: GeometryWeights = field(default_factory=GeometryWeights)
 
 
@@ -99,16 +98,14 @@ class GeometryFit:
         stage: GeometryPass,
         binding: MeshBinding,
         appearance: Appearance,
-        rows: Tensor | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> None:
-        """Run one pass over ``rows`` (the training rows unless given) with the surfels of ``binding``."""
-        rows = self._trained if rows is None else rows
+        """Run one pass over the training rows with the surfels of ``binding``."""
+        rows = self._trained
         steps = max(1, round(stage.visits * len(rows) / stage.batch))
-        shared = self._shared_parameters(appearance) if stage.shared else {}
+        shared = self._shared_parameters(appearance)
         optimizer = torch.optim.Adam(
-            [{"params": [value], "lr": SHARED_RATES[name] * stage.rate} for name, value in shared.items()]
-            or [{"params": [torch.zeros(1, requires_grad=True)]}],
+            [{"params": [value], "lr": SHARED_RATES[name] * stage.rate} for name, value in shared.items()],
             betas=(0.9, 0.98),
             eps=1e-15,
         )
@@ -119,7 +116,7 @@ class GeometryFit:
                 queue = torch.cat([queue, rows[torch.randperm(len(rows), generator=self._random)]])
             chosen, queue = queue[: stage.batch].unique(), queue[stage.batch :]
             decay = 0.1 ** (step / steps)
-            for group, name in zip(optimizer.param_groups, shared, strict=False):
+            for group, name in zip(optimizer.param_groups, shared, strict=True):
                 group["lr"] = SHARED_RATES[name] * stage.rate * decay
             leaves = self.table.leaves(chosen)
             optimizer.zero_grad(set_to_none=True)
@@ -129,8 +126,7 @@ class GeometryFit:
                 self.rejected_steps += 1  # a step that would poison the state is not taken
                 continue
             self.table.step(chosen, leaves, stage.rate * decay)
-            if stage.shared:
-                optimizer.step()
+            optimizer.step()
             if progress is not None:
                 progress((step + 1) / steps)
         for value in shared.values():
@@ -187,12 +183,10 @@ class GeometryFit:
                 total = total + w.color * losses.photometric(out.rgb, target, level.colored, area)
         total = total + self._pose_terms(w, rows, leaves, surfels) * len(rows)
         total = total / len(rows)
-        if stage.shared:
-            d = self.shape.displacement
-            total = total + w.shape * self.shape.betas.square().sum()
-            total = total + w.laplacian * losses.laplacian(d, self._edges)
-            total = total + w.thickness * d.square().mean()
-        return total
+        d = self.shape.displacement
+        total = total + w.shape * self.shape.betas.square().sum()
+        total = total + w.laplacian * losses.laplacian(d, self._edges)
+        return total + w.thickness * d.square().mean()
 
     def _pose_terms(
         self, w: GeometryWeights, rows: Tensor, leaves: dict[str, Tensor], surfels: PosedSurfels

@@ -10,12 +10,16 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.fitting.kinematics import POSE_SIZE, pose_jacobian, shape_jacobian, turned
+from mass_engine.fitting.light import LightSample, sample_colors, solve_light
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.registration import (
     Evidence2D,
     RegistrationWeights,
+    matrices,
     normal_equations,
     observe,
+    observe_far,
+    overlap,
     project_jacobian,
 )
 from mass_engine.fitting.subject import Appearance, PosedSurfels, Shape, mesh_edges, render_row, vertex_normals
@@ -51,8 +55,8 @@ class Priors:
     betas: float = 1.0
     offset: float = 0.008  # of the personal surface
     offset_bend: float = 0.0012  # between neighbouring vertices
+    astray: float = 0.965  # a frame whose silhouettes overlap less has misplaced fingers: look far, too
     frames: float = 1.0  # evidence of neighbouring frames errs together
-    landmark: float = 0.08  # of the tracker's points, hand sizes
     landmark_knee: float = 0.08  # from here on a point's error counts linearly, hand sizes
 
 
@@ -64,6 +68,7 @@ class Round:
     texture: bool = True
     betas: bool = True
     offsets: bool = True
+    landmark: float = 0.08  # standard deviation of the tracker's points, hand sizes
     weights: RegistrationWeights = field(default_factory=RegistrationWeights)
 
 
@@ -82,6 +87,7 @@ class Registrar:
         self.views, self.table, self.shape = views, table, shape
         self.camera, self.raster = camera, raster
         self.priors = priors or Priors()
+        self.light = white_light()
         self._limits, self._axes = joint_limits().double(), joint_frames(shape.model).double()
         self._edges = mesh_edges(shape.model.faces)
         self._trained = [row for row, view in enumerate(views) if not view.heldout]
@@ -111,6 +117,7 @@ class Registrar:
         systems: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]] = []
         blocks, sides = torch.zeros(vertices, 3, 3), torch.zeros(vertices, 3)
         pulls: list[float] = []
+        lit: list[LightSample] = []
         for start in range(0, len(chosen), CHUNK):
             part = chosen[start : start + CHUNK]
             pose = self._poses(part)
@@ -125,29 +132,38 @@ class Registrar:
                 with torch.no_grad():
                     out = render_row(appearance, surfels, place, binding.bones, level.camera, self.raster)
                 skin = jacobian.vertices[place]
-                evidence = observe(
-                    level, out, skin, vertex_normals(skin, subdivision.faces), stage.weights, stage.texture
-                )
+                normals = vertex_normals(skin, subdivision.faces)
+                evidence = observe(level, out, skin, normals, stage.weights, stage.texture)
+                if shared and stage.texture:
+                    usable = level.hand * level.colored
+                    lit.append(sample_colors(level.rgb, usable, evidence.pixels, normals, evidence.seen))
                 onto = project_jacobian(level, skin)
                 j = onto @ jacobian.of(place)
                 p = j.shape[-1]
                 if of_shape is not None:
                     j = torch.cat([j, onto @ of_shape[place]], -1)
-                a, b = normal_equations(evidence, j)
+                a, b = normal_equations(evidence.hessian, evidence.gradient, j)
+                if overlap(level, out.alpha) < self.priors.astray:
+                    away = observe_far(level, out.alpha, evidence.pixels, stage.weights)
+                    far, draw = normal_equations(*away, j[..., :p])
+                    a[:p, :p] += far
+                    b[:p] += draw
                 a, b = a * self.priors.trust, b * self.priors.trust
                 systems.append((a[:p, :p], b[:p], a[p:, :p], a[p:, p:], b[p:]))
                 pulls.append(_pull(evidence))
                 if shared and stage.offsets:
                     lever = onto @ jacobian.turns[place]
-                    h = evidence.matrices() @ lever
+                    h = matrices(evidence.hessian) @ lever
                     blocks += lever.mT @ h
                     sides += (lever.mT @ evidence.gradient.unsqueeze(-1)).squeeze(-1)
-        steps, betas = self._solve(chosen, systems, targets)
+        steps, betas = self._solve(chosen, systems, targets, stage.landmark)
         self._move(chosen, steps)
         if shared and stage.betas:
             self.shape.betas += betas.clamp(-0.5, 0.5).float()
         if shared and stage.offsets:
             self._move_surface(subdivision, blocks, sides, count)
+        if lit:
+            self.light = solve_light(lit, vertices)
         return sum(pulls) / max(len(pulls), 1)
 
     def sweep(self, stages: Sequence[Round], binding: MeshBinding, gather: Gather, memory: float = 0.95) -> None:
@@ -206,6 +222,7 @@ class Registrar:
         rows: list[int],
         systems: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]],
         targets: tuple[Tensor, Tensor],
+        landmark: float,
     ) -> tuple[Tensor, Tensor]:
         """Steps [B,51] of the poses and [10] of the shape: the poses are eliminated first (Schur)."""
         p = self.priors
@@ -215,7 +232,7 @@ class Registrar:
         damping = torch.cat([torch.full((48,), p.damping), torch.full((3,), p.shift_damping)]).double()
         pull, near = targets
         limit, limit_side = self._limit_terms(rows)
-        mark, mark_side = self._landmark_terms(rows)
+        mark, mark_side = self._landmark_terms(rows, landmark)
         own = torch.stack([a for a, *_ in systems]) + limit + mark
         side = torch.stack([b for _, b, *_ in systems]) + limit_side + mark_side
         weight = near.unsqueeze(-1) / motion.square()
@@ -251,7 +268,7 @@ class Registrar:
         side[:, 3:48] = ((strength * beyond).unsqueeze(-2) @ self._axes).squeeze(-2).flatten(1)
         return matrix, side
 
-    def _landmark_terms(self, rows: list[int]) -> tuple[Tensor, Tensor]:
+    def _landmark_terms(self, rows: list[int], sigma: float) -> tuple[Tensor, Tensor]:
         """The tracker's points, robustly: they say which finger is where when outlines cannot."""
         p = self.priors
         index = torch.tensor(rows)
@@ -273,7 +290,7 @@ class Registrar:
         apart = ((self._points[index] - here) / self._sizes[index].view(-1, 1, 1)).double()
         length = apart.norm(dim=-1).clamp_min(1e-9)
         scores = torch.tensor([self.views[row].score for row in rows], dtype=torch.float64)
-        weight = scores[:, None] * torch.where(length < p.landmark_knee, 1.0, p.landmark_knee / length) / p.landmark**2
+        weight = scores[:, None] * torch.where(length < p.landmark_knee, 1.0, p.landmark_knee / length) / sigma**2
         weighted = jacobian * weight[..., None, None]
         flat = jacobian.flatten(1, 2)
         return flat.mT @ weighted.flatten(1, 2), (weighted.flatten(1, 2).mT @ apart.flatten(1, 2).unsqueeze(-1)).squeeze(-1)

@@ -21,6 +21,9 @@ from mass_engine.fitting.kinematics import POSE_SIZE, PoseJacobian
 from mass_engine.fitting.views import Level
 from mass_engine.raster import RenderOutput
 
+#: Most points of an uncovered outline that are looked at.
+_UNCOVERED = 128
+
 Image = NDArray[np.float32]
 
 
@@ -41,16 +44,14 @@ class RegistrationWeights:
 class Evidence2D:
     """How each vertex wants to move in the picture: the quadratic form d^T H d - 2 g^T d per vertex.
 
-    ``hessian`` [V,3] (xx, xy, yy) and ``gradient`` [V,2], in pixels of the level.
+    ``hessian`` [V,3] (xx, xy, yy) and ``gradient`` [V,2], in pixels of the level. ``pixels`` [V,2] is where
+    the vertices are, ``seen`` [V] which of them face the camera with nothing before them.
     """
 
     hessian: Tensor
     gradient: Tensor
-
-    def matrices(self) -> Tensor:
-        """``hessian`` as [V,2,2]."""
-        xx, xy, yy = self.hessian.unbind(-1)
-        return torch.stack([xx, xy, xy, yy], -1).unflatten(-1, (2, 2))
+    pixels: Tensor
+    seen: Tensor
 
 
 def observe(
@@ -72,7 +73,8 @@ def observe(
     _rim(level, alpha, xy, seen, facing.numpy(), weights, hessian, gradient)
     if texture:
         _texture(level, out, xy, seen & (facing.numpy() > 0.15), weights, hessian, gradient)
-    return Evidence2D(torch.from_numpy(hessian), torch.from_numpy(gradient))
+    clear = torch.from_numpy(seen) & (facing > 0.3)
+    return Evidence2D(torch.from_numpy(hessian), torch.from_numpy(gradient), pixels, clear)
 
 
 def _rim(
@@ -86,11 +88,8 @@ def _rim(
     gradient: Image,
 ) -> None:
     """Vertices at the render's outline go to the mask's."""
-    hand = level.hand.numpy()
-    valid = level.valid.numpy()
-    free = cv2.erode(valid, np.ones((7, 7), np.uint8))
-    free[:2], free[-2:], free[:, :2], free[:, -2:] = 0, 0, 0, 0
-    here, there = signed_distance(alpha), signed_distance(hand)
+    free = _free(level)
+    here, there = signed_distance(alpha), signed_distance(level.hand.numpy())
     inner = _sample(here, xy)
     picked = np.nonzero((np.abs(inner) < 2.5) & (np.abs(facing) < 0.45) & seen & (_sample(free, xy) > 0.9))[0]
     if len(picked) == 0:
@@ -145,6 +144,42 @@ def _texture(
     gradient[picked] += share * np.stack([first[:, 3], last], -1)
 
 
+def observe_far(level: Level, alpha: Tensor, pixels: Tensor, weights: RegistrationWeights) -> tuple[Tensor, Tensor]:
+    """What lies far off, for a pose only: ``hessian`` [V,3] and ``gradient`` [V,2] as in Evidence2D.
+
+    Outline of the mask that the render stays away from draws its nearest vertex, seen or not; vertices out
+    in the background are drawn back to the mask. The surface is not to grow for a finger that is misplaced.
+    """
+    xy = (pixels - 0.5).numpy().astype(np.float32)
+    free = _free(level)
+    here, there = signed_distance(alpha.numpy()), signed_distance(level.hand.numpy())
+    hessian, gradient = np.zeros((len(xy), 3), np.float32), np.zeros((len(xy), 2), np.float32)
+    rows, columns = np.nonzero((np.abs(there) < 1.0) & (here < -weights.huber) & (free > 0.5))
+    if len(rows) > 0:
+        every = 1 + len(rows) // _UNCOVERED
+        points = np.stack([columns, rows], -1)[::every].astype(np.float32)
+        nearest = np.square(points[:, None] - xy[None]).sum(-1).argmin(1)
+        apart = points - xy[nearest]
+        weight = every * weights.huber / np.maximum(np.linalg.norm(apart, axis=-1), weights.huber) / weights.rim**2
+        np.add.at(hessian, nearest, weight[:, None] * np.array([1.0, 0.0, 1.0], np.float32))
+        np.add.at(gradient, nearest, weight[:, None] * apart)
+    out = -_sample(there, xy)
+    lost = np.nonzero((out > weights.huber) & (_sample(free, xy) > 0.9))[0]
+    if len(lost) > 0:
+        n = _direction(cv2.GaussianBlur(there, (0, 0), 1.5), xy[lost])
+        size = float((level.hand > 0.5).sum()) / len(xy)  # pixels a vertex stands for
+        weight = size * weights.huber / out[lost] / weights.rim**2
+        hessian[lost] += weight[:, None] * np.stack([n[:, 0] ** 2, n[:, 0] * n[:, 1], n[:, 1] ** 2], -1)
+        gradient[lost] += (weight * out[lost])[:, None] * n
+    return torch.from_numpy(hessian), torch.from_numpy(gradient)
+
+
+def overlap(level: Level, alpha: Tensor) -> float:
+    """Intersection over union of the render's silhouette and the mask, ignored pixels left out."""
+    drawn, hand = (alpha > 0.5) & (level.valid > 0.5), (level.hand > 0.5) & (level.valid > 0.5)
+    return float((drawn & hand).sum()) / max(float((drawn | hand).sum()), 1.0)
+
+
 def project_jacobian(level: Level, vertices: Tensor) -> Tensor:
     """d pixels / d world position [V,2,3] of a level's camera."""
     camera = level.camera
@@ -158,13 +193,19 @@ def project_jacobian(level: Level, vertices: Tensor) -> Tensor:
     return camera.K[:2, :2] @ rows @ rotation
 
 
-def normal_equations(evidence: Evidence2D, jacobian: Tensor) -> tuple[Tensor, Tensor]:
+def normal_equations(hessian: Tensor, gradient: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
     """``jacobian`` [V,2,P] of pixels -> the matrix [P,P] and the right side [P] of the Gauss-Newton step."""
-    used = (evidence.hessian[:, 0] + evidence.hessian[:, 2]) > 0
+    used = (hessian[:, 0] + hessian[:, 2]) > 0
     j = jacobian[used]
-    weighted = evidence.matrices()[used] @ j
+    weighted = matrices(hessian[used]) @ j
     flat = j.flatten(0, 1)
-    return (flat.T @ weighted.flatten(0, 1)).double(), (flat.T @ evidence.gradient[used].flatten()).double()
+    return (flat.T @ weighted.flatten(0, 1)).double(), (flat.T @ gradient[used].flatten()).double()
+
+
+def matrices(hessian: Tensor) -> Tensor:
+    """[V,3] (xx, xy, yy) as [V,2,2]."""
+    xx, xy, yy = hessian.unbind(-1)
+    return torch.stack([xx, xy, xy, yy], -1).unflatten(-1, (2, 2))
 
 
 def signed_distance(coverage: Image) -> Image:
@@ -176,6 +217,13 @@ def signed_distance(coverage: Image) -> Image:
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     # A pixel next to the outline is half a pixel from it on average, not one.
     return np.asarray(distance - 0.5 * np.sign(distance), np.float32)
+
+
+def _free(level: Level) -> Image:
+    """One where an outline is the hand's own: away from ignored pixels and the picture's border."""
+    free = np.asarray(cv2.erode(level.valid.numpy(), np.ones((7, 7), np.uint8)), np.float32)
+    free[:2], free[-2:], free[:, :2], free[:, -2:] = 0, 0, 0, 0
+    return free
 
 
 def _high_pass(grey: Image, inside: Image, sigma: float) -> Image:

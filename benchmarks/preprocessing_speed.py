@@ -1,7 +1,7 @@
 """Time and memory of everything before the fit, on a clip enlarged to 720p.
 
 ``python benchmarks/preprocessing_speed.py VIDEO... [--rows 720] [--repeat 3]`` enlarges each clip into a
-temporary folder, prepares it (read, track, segment, align; all frames) and prints milliseconds per frame
+temporary folder, prepares it (read, track, segment, align) and prints milliseconds per frame
 read, medians over the repeats, with the stages' shares, and the peak memory of the process. Decoding is part
 of tracking and, a second time, of segmenting.
 """

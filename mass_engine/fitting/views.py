@@ -72,6 +72,7 @@ class View:
 
     def level(self, side: int) -> Level:
         """The view with its longer side reduced to at most ``side`` pixels (kept for the next call)."""
+        side = min(side, max(self.labels.shape))  # nothing is enlarged: all larger sides are one level
         if side not in self._levels:
             self._levels[side] = self._reduce(side)
         return self._levels[side]

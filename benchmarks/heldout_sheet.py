@@ -1,4 +1,6 @@
-"""Held-out frames of a clip beside their renders and the error: ``python benchmarks/heldout_sheet.py VIDEO OUT.png``.
+"""Held-out frames of a clip beside their renders and the error.
+
+``python benchmarks/heldout_sheet.py VIDEO OUT.png``
 
 Fits VIDEO with every 8th frame held out, prints the mean scores and draws up to eight of these frames: video,
 render over black, absolute error in the mask (times four), and the two silhouettes (green: mask alone; red:

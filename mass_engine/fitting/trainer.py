@@ -22,6 +22,7 @@ from mass_engine.hand.pose import HandPose
 from mass_engine.raster import RasterOptions
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import white_light
+from mass_engine.threads import one_thread
 from mass_engine.tracking.alignment import interpolate_pose
 
 #: How far into the hand from its wrist joint it may be cut, metres at the mean size.
@@ -146,7 +147,8 @@ def fit_hand(
         geometry.run(stage, coarse, look, progress=part(share, f"stage 1 at {stage.side} px"))
         done += share
     registrar = Registrar(views, table, shape, camera, raster)
-    _register(registrar, schedule, bind, seed, part(shares.registration, "stage 1, registration"))
+    with one_thread():  # many small products a frame
+        _register(registrar, schedule, bind, seed, part(shares.registration, "stage 1, registration"))
     done += shares.registration
     light = registrar.light
 

@@ -7,8 +7,7 @@ directions, a weak depth cue.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from mass_engine.camera import Camera
 from mass_engine.hand.builtin import joint_frames, joint_limits
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import JOINT_PARENTS, TIP_PARENTS, HandPose
+from mass_engine.threads import one_thread
 from mass_engine.tracking.landmarks import HandLandmarks
 from mass_engine.tracking.offsets import tracked_points
 
@@ -99,18 +99,7 @@ def initial_pose(model: HandModel, landmarks: Sequence[HandLandmarks], camera: C
     )
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Tensors of a few thousand numbers: a second thread only waits, on a busy machine for long."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-@_one_thread()
+@one_thread()  # tensors of a few thousand numbers
 def align_landmarks(
     model: HandModel,
     landmarks: Sequence[HandLandmarks],

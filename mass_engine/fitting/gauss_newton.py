@@ -61,7 +61,7 @@ class Priors:
     shift_damping: float = 0.01
     betas: float = 1.0
     offset: float = 0.008  # of the personal surface
-    offset_bend: float = 0.0016  # between neighbouring vertices
+    offset_bend: float = 0.0012  # between neighbouring vertices
     astray: float = 0.955  # a frame whose silhouettes overlap less has misplaced fingers: look far, too
     landmark_knee: float = 0.08  # from here on a point's error counts linearly, hand sizes
 

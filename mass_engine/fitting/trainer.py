@@ -31,7 +31,7 @@ WRIST_REACH = 0.03
 #: that slides shows in one frame what it hides in another: the hand ends where it was never seen.
 BACKGROUND_WEIGHT, FOREARM_WEIGHT = 0.2, 0.004
 #: How far the surface stands over the mask's outline, pixels: a hole shows the background, a rim only skin.
-RIM_BIAS = 0.5
+RIM_BIAS = 0.4
 #: Frames whose mean texture the others are registered against.
 REGISTRATION_FRAMES = 100
 #: The steps of every frame in the sweep.
@@ -70,7 +70,7 @@ def schedule_for(preset: str) -> Schedule:
     pose = Round(160, texture=False, betas=False, offsets=False)
     surface = replace(pose, offsets=True)
     standing = RegistrationWeights(rim_bias=RIM_BIAS)
-    heldout = (*(replace(pose, side=320),) * 2, *(replace(pose, side=640, weights=standing),) * 3)
+    heldout = (replace(pose, side=320), *(replace(pose, side=640, weights=standing),) * 2)
     if preset == "draft":
         return Schedule(
             1,
@@ -85,8 +85,8 @@ def schedule_for(preset: str) -> Schedule:
             256,
         )
     pair = (Round(320, offsets=False), Round(320, betas=False))
-    texture = (*pair * 3, *(Round(640, weights=standing),) * 6)
-    appearance = (AppearancePass(320, 2), AppearancePass(640, 5, rate=0.7, view_dependent=True))
+    texture = (*pair * 3, *(Round(640, weights=standing),) * 5)
+    appearance = (AppearancePass(320, 2), AppearancePass(640, 3, rate=0.7, view_dependent=True))
     outline = (*(pose,) * 4, *(surface,) * 2)
     if preset == "auto":
         return Schedule(1, 1, 3, (first, second), outline, texture, appearance, heldout, 60, 640)

@@ -11,6 +11,7 @@ from torch import Tensor
 from mass_engine.fitting import losses
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.subject import (
+    START_OPACITY,
     Appearance,
     PosedSurfels,
     Shape,
@@ -22,9 +23,6 @@ from mass_engine.fitting.views import Level, View
 from mass_engine.raster import RasterOptions
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import irradiance_basis, white_light
-
-#: Opacity every surfel starts from: the hand is opaque.
-START_OPACITY = 0.95
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -197,7 +197,7 @@ class Registrar:
                 known = total[:, 3:] > 0.05
                 mean = total[:, :3].sum(0) / total[:, 3].sum()
                 albedo = torch.where(known, total[:, :3] / total[:, 3:].clamp_min(1e-6), mean)
-                look = plain(binding, albedo)
+                look = replace(Appearance.plain(binding.count, white_light()), albedo=albedo)
                 for stage in stages:
                     self.step(stage, binding, look, [row], motion=False)
             moved[place] = difference(before, self._poses([row]))
@@ -356,13 +356,6 @@ def difference(before: HandPose, after: HandPose) -> Tensor:
         here = axis_angle_to_matrix(getattr(before, name).unflatten(-1, (-1, 3)))
         columns.append(matrix_to_axis_angle(goal @ here.mT).flatten(1))
     return torch.cat([*columns, after.transl - before.transl], -1)
-
-
-def plain(binding: MeshBinding, albedo: Tensor) -> Appearance:
-    """Opaque surfels of one colour from everywhere."""
-    return Appearance(
-        albedo, torch.full((binding.count,), 3.0), torch.zeros(binding.count, 0, 3), white_light()
-    )
 
 
 def conjugate_gradients(apply: Callable[[Tensor], Tensor], right: Tensor, iterations: int) -> Tensor:

@@ -15,6 +15,9 @@ from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
 from mass_engine.surfel.harmonics import evaluate_sh_rest
 from mass_engine.surfel.shading import shade
 
+#: Opacity every surfel starts from: the hand is opaque.
+START_OPACITY = 0.95
+
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Area-weighted unit normals [V,3] of a mesh."""
@@ -56,6 +59,17 @@ class Appearance:
     opacity_logits: Tensor
     sh: Tensor
     light: Tensor
+
+    @staticmethod
+    def plain(count: int, light: Tensor, harmonics: int = 0) -> Appearance:
+        """Grey surfels of the opacity every fit starts from, under ``light``."""
+        opacity = float(torch.logit(torch.tensor(START_OPACITY)))
+        return Appearance(
+            torch.full((count, 3), 0.5),
+            torch.full((count,), opacity),
+            torch.zeros(count, harmonics, 3),
+            light.clone(),
+        )
 
 
 @dataclass

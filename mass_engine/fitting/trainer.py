@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mass_engine.avatar import Avatar, SourceFrames
 from mass_engine.camera import Camera
-from mass_engine.fitting.appearance import START_OPACITY, AppearanceFit, AppearancePass, Evidence, fill_unseen
+from mass_engine.fitting.appearance import AppearanceFit, AppearancePass, Evidence, fill_unseen
 from mass_engine.fitting.gauss_newton import Registrar, Round
 from mass_engine.fitting.geometry import GeometryFit, GeometryPass, GeometryWeights
 from mass_engine.fitting.poses import PoseTable
@@ -140,7 +140,7 @@ def fit_hand(
 
     for stage, share in zip(schedule.geometry, shares.geometry, strict=True):
         coarse = bind(stage.levels, stage.depth)
-        look = _plain(coarse, white_light())
+        look = Appearance.plain(coarse.count, white_light())
         if stage.color:
             gatherer = AppearanceFit(views, table, shape, coarse, seed, raster)
             look.albedo = fill_unseen(gatherer.gather(look.light, stage.side, 40), coarse, 0.5)
@@ -155,7 +155,7 @@ def fit_hand(
     binding = bind(schedule.levels, schedule.depth)
     second = AppearanceFit(views, table, shape, binding, seed, raster)
     evidence = second.gather(light, schedule.gather_side, schedule.gather_frames)
-    appearance = _plain(binding, light, schedule.harmonics)
+    appearance = Appearance.plain(binding.count, light, schedule.harmonics)
     appearance.albedo = fill_unseen(evidence, binding, 0.5)
     for step, share in zip(schedule.appearance, shares.appearance, strict=True):
         second.run(appearance, step, progress=part(share, f"stage 2 at {step.side} px"))
@@ -166,7 +166,7 @@ def fit_hand(
     if heldout:
         outline = bind(1, 0)
         for turn in schedule.heldout:
-            registrar.step(turn, outline, _plain(outline, light), heldout)
+            registrar.step(turn, outline, Appearance.plain(outline.count, light), heldout)
 
     kept = _keep(evidence, binding, model)
     avatar = Avatar(
@@ -206,7 +206,7 @@ def _register(
     fit = registrar
     coarse = bind(1, 0)
     for done, turn in enumerate(schedule.outline):
-        fit.step(turn, coarse, _plain(coarse, fit.light))
+        fit.step(turn, coarse, Appearance.plain(coarse.count, fit.light))
         progress((done + 1) / total)
     if not schedule.texture:
         return
@@ -215,7 +215,7 @@ def _register(
     fit.sweep(SWEEP, fine, gatherer.colors_of)
     for done, turn in enumerate(schedule.texture):
         progress((len(schedule.outline) + 4 + 2 * done) / total)
-        look = _plain(fine, fit.light)
+        look = Appearance.plain(fine.count, fit.light)
         look.albedo = fill_unseen(gatherer.gather(fit.light, turn.side, REGISTRATION_FRAMES), fine, 0.5)
         fit.step(turn, fine, look)
 
@@ -236,20 +236,6 @@ def _shares(schedule: Schedule) -> _Shares:
     return _Shares(
         [value / total for value in first], sum(turns) / total, [value / total for value in second]
     )
-
-
-def _plain(binding: MeshBinding, light: Tensor, harmonics: int = 0) -> Appearance:
-    """Grey, opaque surfels under ``light``."""
-    return Appearance(
-        torch.full((binding.count, 3), 0.5),
-        torch.full((binding.count,), _logit(START_OPACITY)),
-        torch.zeros(binding.count, harmonics, 3),
-        light.clone(),
-    )
-
-
-def _logit(probability: float) -> float:
-    return float(torch.logit(torch.tensor(probability)))
 
 
 def _keep(evidence: Evidence, binding: MeshBinding, model: HandModel) -> Tensor:

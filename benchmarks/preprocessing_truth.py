@@ -28,8 +28,8 @@ from mass_engine.avatar import row_pose
 from mass_engine.camera import Camera
 from mass_engine.fitting.geometry import GeometryFit
 from mass_engine.fitting.poses import PoseTable
+from mass_engine.fitting.schedule import schedule_for
 from mass_engine.fitting.subject import Appearance, Shape, draw, pose_surfels
-from mass_engine.fitting.trainer import schedule_for
 from mass_engine.fitting.views import View
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose

@@ -18,36 +18,36 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.channels import Channel, ChannelImage, extract, parse_channel, raster_options
+from mass_engine.deform.network import DeformationConfig
 from mass_engine.deform.posing import CompiledSurfels, MeshPose, PosableSurfels, ShadedSurfels
 from mass_engine.errors import BadArgumentError, EngineError
-from mass_engine.fitting.subject import (
-    Appearance,
-    PosedSurfels,
-    Shape,
-    pose_surfels,
-    surfel_colors,
-)
+from mass_engine.fitting.skin import Skin
+from mass_engine.fitting.subject import Appearance, PosedSurfels, Shape, surfel_colors
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose, Side
 from mass_engine.hand.poses import POSE_NAMES, parse_pose
 from mass_engine.raster import RasterOptions, RenderOutput, rasterize
-from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
+from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.cloud import SurfelCloud
 from mass_engine.surfel.harmonics import rgb_to_sh0
 from mass_engine.threads import one_thread
 from mass_engine.viewpoint import parse_camera
 
 FILE_NAME = "avatar.safetensors"
-_FORMAT = "2"
+_FORMAT = "3"
 
 
 @dataclass(frozen=True)
 class SourceFrames:
-    """The clip's own poses: ``indices`` [F] of the frames, ``heldout`` [F], ``pose`` batched [F]."""
+    """The clip's own poses: ``indices`` [F] of the frames, ``heldout`` [F], ``pose`` batched [F].
+
+    ``gains`` [F,3] by which each frame's colours are brighter than the avatar's (exposure, white balance).
+    """
 
     indices: Tensor
     heldout: Tensor
     pose: HandPose
+    gains: Tensor
 
     def pose_of(self, index: int) -> HandPose:
         """The pose of the frame ``index``. Raises BadArgumentError ``pose.no_such_frame``."""
@@ -72,28 +72,22 @@ def row_pose(pose: HandPose, row: int) -> HandPose:
 
 @dataclass
 class Avatar:
-    """A posable hand of surfels. ``kept`` [M] are the surfels of ``binding`` that the fit kept.
+    """A posable hand: the surfels of ``skin`` and what they look like.
 
     Finished: once rendered, changes of its tensors no longer reach the picture.
     """
 
     shape: Shape
-    binding: MeshBinding
-    kept: Tensor
-    appearance: Appearance  # of the kept surfels
+    skin: Skin
+    appearance: Appearance
     camera: Camera  # the fitted camera, whole picture
     frames: SourceFrames
     best_frame: int  # where the hand is seen best: its orientation serves the named poses
 
     def posed(self, pose: HandPose) -> PosedSurfels:
-        """Kept surfels of a batch of poses [B]."""
+        """The surfels of a batch of poses [B]."""
         with torch.no_grad():
-            posed = pose_surfels(self.shape, self.binding, pose)
-            every = posed.attached
-            kept = AttachedSurfels(
-                every.means[:, self.kept], every.tangents[:, self.kept], every.normals[:, self.kept]
-            )
-            return PosedSurfels(kept, posed.outline_vertices, posed.bone_rotations, posed.joints)
+            return self.skin.pose(self.shape, pose)
 
     def render_pose(
         self, pose: HandPose, camera: Camera, options: RasterOptions | None = None
@@ -110,15 +104,23 @@ class Avatar:
 
     @cached_property
     def _compiled(self) -> CompiledSurfels:
-        look = self.appearance
-        opacities = torch.sigmoid(look.opacity_logits)
-        return PosableSurfels(self.binding, self.kept, look.albedo, opacities, look.sh, look.light).compiled()
+        look, skin = self.appearance, self.skin
+        return PosableSurfels(
+            skin.binding,
+            skin.sources,
+            look.albedo,
+            torch.sigmoid(look.opacity_logits),
+            look.sh,
+            look.light,
+            None if skin.deformation is None else skin.deformation.freeze(),
+            skin.detached_from,
+        ).compiled()
 
     def _shaded(self, pose: HandPose, camera: Camera) -> ShadedSurfels:
-        """The kept surfels in one pose (a batch of one) as ``camera`` sees them."""
+        """The surfels in one pose (a batch of one) as ``camera`` sees them."""
         with torch.no_grad(), one_thread():
             hand = self.shape.model.posed(pose, self.shape.displacement)
-            refined = self.binding.subdivision.apply(hand.vertices)[0]
+            refined = self.skin.binding.subdivision.apply(hand.vertices)[0]
             center = -camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3]
             bones = hand.bone_transforms[0, :, :3, :3]
             return self._compiled.posed(MeshPose(refined, bones, center, pose.hand_pose[0], pose.betas[0]))
@@ -207,8 +209,9 @@ class Avatar:
             self.appearance.light,
         )
         attached = surfels.row(0)
-        bones = self.binding.bones[self.kept]
+        bones = self.skin.bones
         colors = surfel_colors(plain, attached, surfels.bone_rotations[0], bones, self.camera)
+        opacities = torch.sigmoid(self.appearance.opacity_logits)
         scales, quats = attached.scales_quats()
         sh = rgb_to_sh0(colors).unsqueeze(1)
         if pose_spec.strip() == "rest":
@@ -217,9 +220,9 @@ class Avatar:
             attached.means,
             scales,
             quats,
-            torch.sigmoid(self.appearance.opacity_logits),
+            opacities if surfels.mask is None else opacities * surfels.mask[0],
             sh,
-            self.binding.surfel_faces[self.kept],
+            self.skin.faces,
         )
 
     def save(self, path: Path) -> None:
@@ -229,7 +232,7 @@ class Avatar:
         tensors = {
             "shape.betas": self.shape.betas,
             "shape.displacement": self.shape.displacement,
-            "kept": self.kept,
+            "sources": self.skin.sources,
             "albedo": self.appearance.albedo,
             "opacity_logits": self.appearance.opacity_logits,
             "sh": self.appearance.sh,
@@ -237,6 +240,7 @@ class Avatar:
             "camera.K": self.camera.K,
             "camera.world_to_camera": self.camera.world_to_camera,
             "frames.indices": self.frames.indices,
+            "frames.gains": self.frames.gains,
             "frames.heldout": self.frames.heldout,
             "frames.betas": pose.betas,
             "frames.global_orient": pose.global_orient,
@@ -247,11 +251,17 @@ class Avatar:
         metadata = {
             "format": _FORMAT,
             "side": model.side,
-            "levels": str(self.binding.levels),
-            "depth": str(self.binding.depth),
+            "levels": str(self.skin.binding.levels),
+            "depth": str(self.skin.binding.depth),
+            "widened": str(int(self.skin.binding.widened)),
+            "detached_from": str(self.skin.detached_from),
             "best_frame": str(self.best_frame),
             "size": json.dumps([self.camera.width, self.camera.height]),
         }
+        moving = self.skin.deformation
+        if moving is not None:
+            tensors |= {f"deformation.{name}": value for name, value in moving.tensors().items()}
+            metadata["deformation"] = json.dumps(moving.config.to_dict())
         partial = target.with_name(target.name + ".partial")
         save_file(
             {name: value.detach().contiguous().clone() for name, value in tensors.items()}, partial, metadata
@@ -280,7 +290,7 @@ class Avatar:
                 metadata = cast("dict[str, str]", file.metadata() or {})
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
             return _assemble(metadata, tensors)
-        except (SafetensorError, KeyError, ValueError, RuntimeError, IndexError) as error:
+        except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
             raise EngineError(
                 "avatar.corrupt", f"{source.name} is not a readable avatar ({error}).", "Fit it again."
             ) from error
@@ -318,10 +328,28 @@ def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Avatar:
     )
     return Avatar(
         shape,
-        MeshBinding.build(model, int(metadata["levels"]), int(metadata["depth"])),
-        tensors["kept"],
+        _skin(metadata, tensors, model),
         Appearance(tensors["albedo"], tensors["opacity_logits"], tensors["sh"], tensors["light"]),
         Camera(tensors["camera.K"], tensors["camera.world_to_camera"], int(width), int(height)),
-        SourceFrames(tensors["frames.indices"], tensors["frames.heldout"], pose),
+        SourceFrames(tensors["frames.indices"], tensors["frames.heldout"], pose, tensors["frames.gains"]),
         int(metadata["best_frame"]),
     )
+
+
+def _skin(metadata: dict[str, str], tensors: dict[str, Tensor], model: HandModel) -> Skin:
+    levels, depth, widened = (int(metadata[name]) for name in ("levels", "depth", "widened"))
+    binding = MeshBinding.build(model, levels, depth, bool(widened))
+    sources, start = tensors["sources"], int(metadata["detached_from"])
+    if not (len(sources) and 0 <= int(sources.min()) <= int(sources.max()) < binding.count):
+        raise ValueError("a surfel is not in the binding")
+    if not 0 <= start <= len(sources):
+        raise ValueError("detached_from is out of range")
+    skin = Skin(binding, sources, start)
+    if "deformation" in metadata:
+        config = DeformationConfig.from_dict(json.loads(metadata["deformation"]))
+        skin.deformation = skin.new_deformation(model, config, 0)
+        prefix = "deformation."
+        skin.deformation.load_tensors(
+            {name.removeprefix(prefix): v for name, v in tensors.items() if name.startswith(prefix)}
+        )
+    return skin

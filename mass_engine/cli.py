@@ -15,8 +15,19 @@ from pathlib import Path
 from types import FrameType
 
 from mass_engine.errors import BadArgumentError, EngineError
+from mass_engine.fitting.components import BINDINGS, Components
 from mass_engine.options import DEVICES, PRESETS, SEGMENTERS, SIDES, FitOptions
 from mass_engine.progress import Progress
+
+#: Parts of the method that ``--no-...`` switches off.
+COMPONENT_SWITCHES = {
+    "densify": "no fractal surfels in the corners of faces",
+    "detached": "no surfels that leave the mesh",
+    "deform": "no network that moves and masks the detached surfels",
+    "refine_pose": "the tracker's poses, the template's shape",
+    "shading": "no light: one colour from every side",
+    "harmonics": "no view-dependent colour",
+}
 
 Command = Callable[[argparse.Namespace], None]
 
@@ -67,7 +78,9 @@ def build_parser() -> argparse.ArgumentParser:
     fit.add_argument("--device", choices=DEVICES, default="auto")
     fit.add_argument("--fov", type=float, metavar="DEGREES", help="field of view of the longer image side")
     fit.add_argument("--max-frames", type=int, default=FitOptions.max_frames, metavar="N")
+    fit.add_argument("--resume", action="store_true", help="go on with the killed fit in RUN")
     fit.add_argument("--json", action="store_true", help="progress as JSON lines on standard output")
+    _add_components(fit)
     fit.set_defaults(run=_fit)
 
     render = commands.add_parser("render", help="render an avatar: its frames, or any pose and camera")
@@ -106,6 +119,15 @@ def build_parser() -> argparse.ArgumentParser:
     bench.add_argument("rest", nargs=argparse.REMAINDER)
     bench.set_defaults(run=_bench)
     return parser
+
+
+def _add_components(fit: argparse.ArgumentParser) -> None:
+    group = fit.add_argument_group("parts of the method")
+    for name, what in COMPONENT_SWITCHES.items():
+        group.add_argument(f"--no-{name.replace('_', '-')}", dest=name, action="store_false", help=what)
+    group.add_argument("--exposure", action="store_true", help="a gain per frame and colour channel")
+    group.add_argument("--binding", choices=BINDINGS, default=Components.binding, help="the binding loss")
+    group.add_argument("--levels", type=int, metavar="N", help="Loop levels, 0 to 2")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -164,6 +186,13 @@ def _fit(arguments: argparse.Namespace) -> None:
         device=arguments.device,
         fov=arguments.fov,
         max_frames=arguments.max_frames,
+        resume=arguments.resume,
+        components=Components(
+            **{name: getattr(arguments, name) for name in COMPONENT_SWITCHES},
+            exposure=arguments.exposure,
+            binding=arguments.binding,
+            levels=arguments.levels,
+        ),
     )
     # Heavy imports only once the arguments are good.
     from mass_engine.pipeline import fit_hands_to_directory, fit_to_directory

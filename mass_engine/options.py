@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mass_engine.errors import BadArgumentError
+from mass_engine.fitting.components import Components
 from mass_engine.template_spec import parse_template
 from mass_engine.tracks_spec import parse_tracks
 
@@ -31,6 +32,9 @@ class FitOptions:
     longer image side; None takes what the file says or a phone-like default; the report says which.
     ``max_frames`` bounds the frames the fit sees; held-out frames do not count, of which at most 160 (or
     ``max_frames``, if that is more) are kept, evenly spread.
+
+    ``resume``: go on after the last step that a killed fit of the same clip and options left in the run's
+    directory. ``components``: parts of the method to switch off.
     """
 
     template: str = "builtin"
@@ -45,6 +49,8 @@ class FitOptions:
     device: str = "auto"
     fov: float | None = None
     max_frames: int = 160
+    resume: bool = False
+    components: Components = field(default_factory=Components)
 
     def __post_init__(self) -> None:
         checks = (

@@ -24,7 +24,9 @@ from mass_engine.fitting.report import (
     peak_memory_bytes,
     versions,
 )
-from mass_engine.fitting.trainer import FitResult, fit_hand, schedule_for
+from mass_engine.fitting.schedule import schedule_for
+from mass_engine.fitting.state import FILE_NAME as CHECKPOINT
+from mass_engine.fitting.trainer import FitResult, fit_hand
 from mass_engine.options import FitOptions
 from mass_engine.preprocess import Clip, prepare_hand
 from mass_engine.progress import FIT_STAGES, Progress, ProgressMeter
@@ -54,9 +56,13 @@ def fit(
     options: FitOptions | None = None,
     report: Report | None = None,
     warn: Warn | None = None,
+    checkpoint: Path | None = None,
 ) -> FitOutcome:
-    """Reconstruct the hand in ``video``. Raises EngineError when the video cannot be used, BadArgumentError
-    ``options.invalid`` for ``side="both"``: see :func:`fit_hands`."""
+    """Reconstruct the hand in ``video``; finished steps are kept in the file ``checkpoint`` until the end.
+
+    Raises EngineError when the video cannot be used, BadArgumentError ``options.invalid`` for
+    ``side="both"``: see :func:`fit_hands`.
+    """
     options = options or FitOptions()
     if options.side == "both":
         raise BadArgumentError(
@@ -65,7 +71,7 @@ def fit(
     notes = _Notes(warn)
     meter = ProgressMeter(report or (lambda _: None))
     found = survey(video, options, meter, notes)
-    return _fit_hand(video, found, found.hands[0], options, meter, notes)
+    return _fit_hand(video, found, found.hands[0], options, meter, notes, checkpoint)
 
 
 def fit_hands(
@@ -73,11 +79,13 @@ def fit_hands(
     options: FitOptions | None = None,
     report: Report | None = None,
     warn: Warn | None = None,
+    out: Path | None = None,
 ) -> Iterator[FitOutcome]:
     """Reconstruct both hands of the person in ``video`` (or the one there is), the right one first.
 
     ``options.side`` is taken as ``both``. One hand after the other, as the results are asked for: only one
-    of them is in memory. Raises EngineError when the video cannot be used.
+    of them is in memory. Finished steps are kept in ``out/right`` and ``out/left`` until each is done. Raises
+    EngineError when the video cannot be used.
     """
     options = replace(options or FitOptions(), side="both")
     shared = {name: share for name, share in FIT_STAGES.items() if name in SHARED_STAGES}
@@ -92,7 +100,8 @@ def fit_hands(
         note = f"{hand.side} hand" if len(found.hands) > 1 else ""
         part = ProgressMeter(whole.part(first + number * share, share, note), own)
         part.seconds |= meter.seconds
-        yield _fit_hand(video, found, hand, options, part, notes)
+        checkpoint = None if out is None else out / hand.side / CHECKPOINT
+        yield _fit_hand(video, found, hand, options, part, notes, checkpoint)
 
 
 class _Notes:
@@ -129,8 +138,16 @@ class _Whole:
 
 
 def _fit_hand(
-    video: Path, found: Survey, hand: SurveyedHand, options: FitOptions, meter: ProgressMeter, notes: _Notes
+    video: Path,
+    found: Survey,
+    hand: SurveyedHand,
+    options: FitOptions,
+    meter: ProgressMeter,
+    notes: _Notes,
+    checkpoint: Path | None,
 ) -> FitOutcome:
+    if checkpoint is not None and not options.resume:
+        checkpoint.unlink(missing_ok=True)
     clip = prepare_hand(video, found, hand, options, meter)
     meter.update("convert", 0.0)
     result = fit_hand(
@@ -138,10 +155,19 @@ def _fit_hand(
         clip.start,
         clip.model,
         clip.camera,
-        schedule_for(options.preset),
+        schedule_for(options.preset, options.components),
         options.seed,
         lambda fraction, message: meter.update("fit", fraction, message),
+        options.components,
+        checkpoint,
     )
+    found_out = result.state.notes
+    if found_out.get("undone_steps"):
+        notes(
+            "fit.stepped_back",
+            f"The fit diverged and stepped back {found_out['undone_steps']} times.",
+            "Look at the held-out frames; a clip with steadier light and less blur fits better.",
+        )
     kind, rows = _evaluate(result, clip, meter)
     tracks = _tracks(video.name, clip, result)
     meter.update("save", 0.0)
@@ -166,8 +192,8 @@ def _fit_hand(
             "choice": clip.choice.summary(),
         },
         surfels={
-            "kept": len(result.avatar.kept),
-            "converted": result.avatar.binding.count,
+            "kept": result.avatar.skin.count,
+            "detached": len(result.avatar.skin.detached),
             "trimmed_as_not_hand": result.trimmed,
             "never_seen": result.unseen,
         },
@@ -176,7 +202,7 @@ def _fit_hand(
         per_frame=rows,
         seconds={name: round(value, 3) for name, value in meter.seconds.items()},
         peak_memory_bytes=peak_memory_bytes(),
-        rejected_steps=result.rejected_steps,
+        fit=found_out,
         seed=options.seed,
         versions=versions(),
         machine=machine(),
@@ -194,7 +220,7 @@ def fit_to_directory(
 ) -> FitReport:
     """:func:`fit`, with everything the command line promises written to ``out``."""
     out.mkdir(parents=True, exist_ok=True)
-    return _write(fit(video, options, report, warn), out)
+    return _write(fit(video, options, report, warn, out / CHECKPOINT), out)
 
 
 def fit_hands_to_directory(
@@ -208,14 +234,17 @@ def fit_hands_to_directory(
     itself gets the report and the tracks of both."""
     out.mkdir(parents=True, exist_ok=True)
     for side in SIDES:
-        shutil.rmtree(out / side, ignore_errors=True)
+        if not options.resume:
+            shutil.rmtree(out / side, ignore_errors=True)
+        (out / side).mkdir(exist_ok=True)
     reports, tracks = [], []
-    for outcome in fit_hands(video, options, report, warn):
+    for outcome in fit_hands(video, options, report, warn, out):
         folder = out / outcome.report.side
-        folder.mkdir()
         reports.append(_write(outcome, folder))
         tracks.append(outcome.tracks)
     write_tracks(tracks, out / "tracks.json")
+    for side in {*SIDES} - {single.side for single in reports}:
+        shutil.rmtree(out / side)
     both = HandsReport.of(reports)
     both.write(out)
     return both
@@ -227,6 +256,7 @@ def _write(outcome: FitOutcome, out: Path) -> FitReport:
     write_ply(outcome.avatar.cloud("rest"), out / "surfels.ply", "2dgs")
     _write_previews(outcome, out / "previews")
     outcome.report.write(out)
+    (out / CHECKPOINT).unlink(missing_ok=True)
     return outcome.report
 
 
@@ -238,7 +268,12 @@ def _evaluate(result: FitResult, clip: Clip, meter: ProgressMeter) -> tuple[str,
     scores: list[dict[str, Any]] = []
     for done, row in enumerate(rows):
         view = clip.views[row]
-        scores.append({"index": view.index, **score_view(result.avatar, view, row_pose(pose, row))})
+        scores.append(
+            {
+                "index": view.index,
+                **score_view(result.avatar, view, row_pose(pose, row), result.avatar.frames.gains[row]),
+            }
+        )
         meter.update("evaluate", (done + 1) / len(rows))
     return ("heldout" if held else "training"), scores
 

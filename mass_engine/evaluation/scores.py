@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mass_engine.avatar import Avatar
 from mass_engine.evaluation import metrics
@@ -14,17 +15,17 @@ from mass_engine.fitting.views import View
 from mass_engine.hand.pose import HandPose
 
 
-def score_view(avatar: Avatar, view: View, pose: HandPose) -> dict[str, float]:
+def score_view(avatar: Avatar, view: View, pose: HandPose, gain: Tensor | None = None) -> dict[str, float]:
     """Scores of one frame, on 8-bit values, inside the view's crop placed on a black picture.
 
     ``psnr_in_mask`` compares the render over black with the video inside the hand mask. The figures
     ``*_hand_on_black`` compare it with the masked video over the whole picture; ignored pixels (forearm)
-    are black in both. ``silhouette_iou`` leaves ignored pixels out.
+    are black in both. ``silhouette_iou`` leaves ignored pixels out. ``gain`` [3] is the frame's exposure.
     """
     level = view.level(1 << 16)
     out = avatar.render_pose(pose, level.camera)
     hand, valid = level.hand > 0.5, level.valid > 0.5
-    render = metrics.to_8bit(out.rgb)
+    render = metrics.to_8bit(out.rgb if gain is None else out.rgb * gain)
     x = round(float(avatar.camera.K[0, 2] - view.camera.K[0, 2]))
     y = round(float(avatar.camera.K[1, 2] - view.camera.K[1, 2]))
     picture, truth = torch.zeros(2, avatar.camera.height, avatar.camera.width, 3)

@@ -63,6 +63,7 @@ class Priors:
     offset: float = 0.008  # of the personal surface
     offset_bend: float = 0.0012  # between neighbouring vertices
     astray: float = 0.955  # a frame whose silhouettes overlap less has misplaced fingers: look far, too
+    worse: float = 0.15  # a step that costs so much of the silhouettes' overlap was a leap: undone
     landmark_knee: float = 0.08  # from here on a point's error counts linearly, hand sizes
 
 
@@ -89,11 +90,16 @@ class Registrar:
         camera: Camera,
         raster: RasterOptions,
         priors: Priors | None = None,
+        shading: bool = True,
     ) -> None:
         self.views, self.table, self.shape = views, table, shape
         self.camera, self.raster = camera, raster
         self.priors = priors or Priors()
-        self.light = white_light()
+        self.light, self._shading = white_light(), shading
+        #: Silhouette overlap [F] and poses [F,...] before each row's last step (overlap 0: none yet).
+        self.memory = {"overlap": torch.zeros(len(views))}
+        self.memory |= {name: value.clone() for name, value in table.values.items()}
+        self.undone = 0
         self._limits, self._axes = joint_limits().double(), joint_frames(shape.model).double()
         self._edges = mesh_edges(shape.model.faces)
         self._trained = [row for row, view in enumerate(views) if not view.heldout]
@@ -108,10 +114,11 @@ class Registrar:
         appearance: Appearance,
         rows: list[int] | None = None,
         motion: bool = True,
-    ) -> float:
-        """One step; returns the mean length of the evidence's pull in pixels of the level.
+    ) -> Tensor:
+        """One step; returns the mean length of the evidence's pull in pixels of the level [B].
 
-        Without ``rows`` all training rows and the shared surface move; with ``rows`` only their poses.
+        Without ``rows`` all training rows and the shared surface move; with ``rows`` only their poses. A row
+        whose silhouette has got clearly worse by its last step goes back to before it, and stays there.
         """
         shared = rows is None
         chosen = self._trained if rows is None else rows
@@ -123,6 +130,7 @@ class Registrar:
         systems: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]] = []
         blocks, sides = torch.zeros(vertices, 3, 3), torch.zeros(vertices, 3)
         pulls: list[float] = []
+        overlaps: list[float] = []
         lit: list[LightSample] = []
         for start in range(0, len(chosen), CHUNK):
             part = chosen[start : start + CHUNK]
@@ -151,7 +159,9 @@ class Registrar:
                 if of_shape is not None:
                     j = torch.cat([j, onto @ of_shape[place]], -1)
                 a, b = normal_equations(evidence.hessian, evidence.gradient, j)
-                if overlap(level, out.alpha) < self.priors.astray:
+                covered = overlap(level, out.alpha)
+                overlaps.append(covered)
+                if covered < self.priors.astray:
                     away = observe_far(level, out.alpha, evidence.pixels, stage.weights)
                     far, draw = normal_equations(*away, j[..., :p])
                     a[:p, :p] += far
@@ -165,17 +175,38 @@ class Registrar:
                     blocks += lever.mT @ h
                     sides += (lever.mT @ evidence.gradient.unsqueeze(-1)).squeeze(-1)
         steps, betas = self._solve(chosen, systems, targets, stage.landmark)
-        self._move(chosen, steps)
+        self._move(chosen, self._step_back(chosen, steps, torch.tensor(overlaps)))
         if shared and stage.betas:
             self.shape.betas += betas.clamp(-0.5, 0.5).float()
         if shared and stage.offsets:
             self._move_surface(subdivision, blocks, sides)
-        if lit:
+        if lit and self._shading:
             self.light = solve_light(lit, vertices)
-        return sum(pulls) / max(len(pulls), 1)
+        return torch.tensor(pulls)
+
+    def _step_back(self, rows: list[int], steps: Tensor, overlaps: Tensor) -> Tensor:
+        """Undo the last step of the rows that it made worse; the others' steps [B,51] stand."""
+        index = torch.tensor(rows)
+        worse = overlaps < self.memory["overlap"][index] - self.priors.worse
+        for name, value in self.table.values.items():
+            before = value[index].clone()
+            value[index[worse]] = self.memory[name][index[worse]]
+            self.memory[name][index[~worse]] = before[~worse]
+        self.memory["overlap"][index[~worse]] = overlaps[~worse]
+        self.undone += int(worse.sum())
+        return torch.where(worse.unsqueeze(-1), torch.zeros_like(steps), steps)
+
+    def forget(self, rows: list[int]) -> None:
+        """Rows that were placed anew have no last step."""
+        self.memory["overlap"][torch.tensor(rows)] = 0.0
 
     def sweep(
-        self, stages: Sequence[Round], binding: MeshBinding, gather: Gather, memory: float = 0.95
+        self,
+        stages: Sequence[Round],
+        binding: MeshBinding,
+        gather: Gather,
+        progress: Callable[[float], None] | None = None,
+        memory: float = 0.95,
     ) -> None:
         """Register frame after frame, outward from the one that shows most, against the texture so far.
 
@@ -188,12 +219,13 @@ class Registrar:
         )
         total = torch.zeros(binding.count, 4)
         moved: dict[int, Tensor] = {}
-        for place in sorted(range(len(trained)), key=lambda place: abs(place - key)):
+        for done, place in enumerate(sorted(range(len(trained)), key=lambda place: abs(place - key))):
             row = trained[place]
             before = self._poses([row])
             if place != key:
                 near = moved[place - 1 if place > key else place + 1]
                 self.table.put(torch.tensor([row]), turned(before, near))
+                self.forget([row])
                 known = total[:, 3:] > 0.05
                 mean = total[:, :3].sum(0) / total[:, 3].sum()
                 albedo = torch.where(known, total[:, :3] / total[:, 3:].clamp_min(1e-6), mean)
@@ -202,6 +234,8 @@ class Registrar:
                     self.step(stage, binding, look, [row], motion=False)
             moved[place] = difference(before, self._poses([row]))
             total = total * memory + gather(row)
+            if progress is not None:
+                progress((done + 1) / len(trained))
 
     def _poses(self, rows: list[int]) -> HandPose:
         index = torch.tensor(rows)

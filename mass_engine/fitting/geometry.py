@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.fitting import losses
+from mass_engine.fitting.guard import Guard
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.subject import (
     Appearance,
@@ -78,8 +79,8 @@ class GeometryFit:
     ) -> None:
         self.views, self.table, self.shape = views, table, shape
         self.camera, self.raster = camera, raster
-        self.rejected_steps = 0
-        self._random = torch.Generator().manual_seed(seed)
+        self.undone = 0
+        self._seed = seed
         self._edges = mesh_edges(shape.model.faces)
         self._limits, self._frames = joint_limits(), joint_frames(shape.model)
         self._points = torch.stack([torch.from_numpy(view.points) for view in views])
@@ -90,8 +91,6 @@ class GeometryFit:
         trained = [row for row, view in enumerate(views) if not view.heldout]
         self._trained = torch.tensor(trained)
         self._before, self._after, self._mix, self._near = _neighbours(views, trained)
-        with torch.no_grad():
-            self._joints = shape.model.joints(table.pose(shape.betas))
 
     def run(
         self,
@@ -101,6 +100,10 @@ class GeometryFit:
         progress: Callable[[float], None] | None = None,
     ) -> None:
         """Run one pass over the training rows with the surfels of ``binding``."""
+        # Everything a pass remembers begins with it: a fit resumed between two passes goes on alike.
+        random = torch.Generator().manual_seed(self._seed * 1009 + stage.side)
+        with torch.no_grad():
+            self._joints = self.shape.model.joints(self.table.pose(self.shape.betas))
         rows = self._trained
         steps = max(1, round(stage.visits * len(rows) / stage.batch))
         shared = self._shared_parameters(appearance)
@@ -110,27 +113,28 @@ class GeometryFit:
             eps=1e-15,
         )
         self.table.reset_momentum()
+        guard = Guard([*shared.values(), *self.table.values.values()])
         queue = torch.zeros(0, dtype=torch.long)
         for step in range(steps):
             if len(queue) < stage.batch:
-                queue = torch.cat([queue, rows[torch.randperm(len(rows), generator=self._random)]])
+                queue = torch.cat([queue, rows[torch.randperm(len(rows), generator=random)]])
             chosen, queue = queue[: stage.batch].unique(), queue[stage.batch :]
-            decay = 0.1 ** (step / steps)
+            decay = guard.rate * 0.1 ** (step / steps)
             for group, name in zip(optimizer.param_groups, shared, strict=True):
                 group["lr"] = SHARED_RATES[name] * stage.rate * decay
             leaves = self.table.leaves(chosen)
             optimizer.zero_grad(set_to_none=True)
-            loss = self._loss(stage, binding, appearance, chosen, leaves)
+            loss = self._loss(stage, binding, appearance, chosen, leaves, random)
             loss.backward()
-            if not self._finite(loss, leaves, shared):
-                self.rejected_steps += 1  # a step that would poison the state is not taken
-                continue
-            self.table.step(chosen, leaves, stage.rate * decay)
-            optimizer.step()
+            if guard.good(loss, [leaf.grad for leaf in leaves.values()]):
+                self.table.step(chosen, leaves, stage.rate * decay)
+                optimizer.step()
             if progress is not None:
                 progress((step + 1) / steps)
+        self.undone += guard.undone
         for value in shared.values():
             value.requires_grad_(False)
+            value.grad = None
 
     def _shared_parameters(self, appearance: Appearance) -> dict[str, Tensor]:
         parameters = {
@@ -141,11 +145,6 @@ class GeometryFit:
         }
         return {name: value.requires_grad_(True) for name, value in parameters.items()}
 
-    @staticmethod
-    def _finite(loss: Tensor, leaves: dict[str, Tensor], shared: dict[str, Tensor]) -> bool:
-        grads = [value.grad for value in (*leaves.values(), *shared.values()) if value.grad is not None]
-        return bool(torch.isfinite(loss)) and all(bool(torch.isfinite(grad).all()) for grad in grads)
-
     def _loss(
         self,
         stage: GeometryPass,
@@ -153,6 +152,7 @@ class GeometryFit:
         appearance: Appearance,
         rows: Tensor,
         leaves: dict[str, Tensor],
+        random: torch.Generator,
     ) -> Tensor:
         w = stage.weights
         surfels = pose_surfels(self.shape, binding, self.table.pose(self.shape.betas, leaves))
@@ -161,7 +161,7 @@ class GeometryFit:
         total = torch.zeros(())
         for place, row in enumerate(rows.tolist()):
             level = self.views[row].level(stage.side)
-            background = torch.rand(3, generator=self._random)
+            background = torch.rand(3, generator=random)
             out = render_row(
                 appearance,
                 surfels,

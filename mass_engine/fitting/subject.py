@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mass_engine.camera import Camera
+from mass_engine.deform.residuals import Residuals
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
 from mass_engine.raster import RasterOptions, RenderOutput, rasterize
@@ -77,13 +78,15 @@ class PosedSurfels:
     """Surfels of a batch of poses (means [B,N,3], tangents [B,N,2,3], normals [B,N,3]).
 
     With ``bone_rotations`` [B,16,3,3], ``joints`` [B,21,3] and the refined mesh's ``outline_vertices``
-    [B,V',3].
+    [B,V',3]. ``mask`` [B,N] multiplies the opacities (None: ones); ``residuals`` [B,D] moved the last D.
     """
 
     attached: AttachedSurfels
     outline_vertices: Tensor
     bone_rotations: Tensor
     joints: Tensor
+    mask: Tensor | None = None
+    residuals: Residuals | None = None
 
     def row(self, row: int) -> AttachedSurfels:
         """The surfels of one pose of the batch."""
@@ -127,9 +130,10 @@ def render_row(
 ) -> RenderOutput:
     """Rasterise one pose of the batch."""
     attached = surfels.row(row)
+    opacities = torch.sigmoid(appearance.opacity_logits)
     return draw(
         attached,
-        torch.sigmoid(appearance.opacity_logits),
+        opacities if surfels.mask is None else opacities * surfels.mask[row],
         surfel_colors(appearance, attached, surfels.bone_rotations[row], bones, camera),
         camera,
         options,

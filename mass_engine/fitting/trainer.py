@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from mass_engine.avatar import Avatar, SourceFrames
 from mass_engine.camera import Camera
-from mass_engine.fitting.appearance import AppearanceFit, AppearancePass, Evidence, fill_unseen
+from mass_engine.fitting.components import Components
+from mass_engine.fitting.conversion import convert, deform_surfels, finish
+from mass_engine.fitting.evidence import Evidence, Scene, colors_of, fill_unseen, gather, spread
 from mass_engine.fitting.gauss_newton import Registrar, Round
-from mass_engine.fitting.geometry import GeometryFit, GeometryPass, GeometryWeights
+from mass_engine.fitting.geometry import GeometryFit, GeometryPass
 from mass_engine.fitting.poses import PoseTable
-from mass_engine.fitting.registration import RegistrationWeights
+from mass_engine.fitting.schedule import SWEEP, Schedule
+from mass_engine.fitting.skin import Skin
+from mass_engine.fitting.state import FitState, fingerprint_of
 from mass_engine.fitting.subject import Appearance, Shape
+from mass_engine.fitting.surfel_fit import SurfelFit, SurfelPass, SurfelWeights
 from mass_engine.fitting.views import View
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
@@ -25,72 +31,12 @@ from mass_engine.surfel.shading import white_light
 from mass_engine.threads import one_thread
 from mass_engine.tracking.alignment import interpolate_pose
 
-#: How far into the hand from its wrist joint it may be cut, metres at the mean size.
-WRIST_REACH = 0.03
-#: What a pixel of background, and of forearm, counts against one of hand when the wrist is cut. A sleeve
-#: that slides shows in one frame what it hides in another: the hand ends where it was never seen.
-BACKGROUND_WEIGHT, FOREARM_WEIGHT = 0.2, 0.004
-#: How far the surface stands over the mask's outline, pixels: a hole shows the background, a rim only skin.
-RIM_BIAS = 0.4
 #: Frames whose mean texture the others are registered against.
 REGISTRATION_FRAMES = 100
-#: The steps of every frame in the sweep.
-SWEEP = tuple(Round(side, betas=False, offsets=False) for side in (160, 320, 640))
+#: Registration ends when the validation frames' pull falls by less than this share in two rounds.
+LEAST_FALL = 0.01
 
-
-@dataclass(frozen=True)
-class Schedule:
-    """How much work a preset does.
-
-    ``levels`` and ``depth`` are the Loop levels and fractal depth of the final surfels; ``harmonics`` is the
-    number of view-dependent coefficients a colour channel has (0, 3, 8, 15). Stage one is ``geometry`` (by
-    gradient, from afar), ``outline`` (registration without texture), then, if there is any ``texture``, a
-    sweep over the frames and registration with it.
-    """
-
-    levels: int
-    depth: int
-    harmonics: int
-    geometry: tuple[GeometryPass, ...]
-    outline: tuple[Round, ...]
-    texture: tuple[Round, ...]
-    appearance: tuple[AppearancePass, ...]
-    heldout: tuple[Round, ...]
-    gather_frames: int
-    gather_side: int
-
-
-def schedule_for(preset: str) -> Schedule:
-    """The schedule of a preset (draft, auto, full)."""
-    rough = GeometryWeights(landmarks=1.0, outline=20.0, limits=1.0)
-    middle = GeometryWeights(landmarks=0.1, outline=20.0)
-    first = GeometryPass(96, 10, rate=2.0, color=False, weights=rough)
-    second = GeometryPass(160, 14, levels=1, depth=0, rate=1.5, weights=middle)
-    # Surface and shape answer to the same evidence: one at a time, or they overshoot together.
-    pose = Round(160, texture=False, betas=False, offsets=False)
-    surface = replace(pose, offsets=True)
-    standing = RegistrationWeights(rim_bias=RIM_BIAS)
-    heldout = (replace(pose, side=320), *(replace(pose, side=640, weights=standing),) * 2)
-    if preset == "draft":
-        return Schedule(
-            1,
-            0,
-            0,
-            (replace(first, visits=8), replace(second, visits=8)),
-            (pose, surface, replace(surface, side=256, weights=standing)),
-            (),
-            (AppearancePass(256, 2),),
-            heldout,
-            40,
-            256,
-        )
-    pair = (Round(320, offsets=False), Round(320, betas=False))
-    texture = (*pair * 3, *(Round(640, weights=standing),) * 5)
-    appearance = (AppearancePass(320, 2), AppearancePass(640, 3, rate=0.7, view_dependent=True))
-    outline = (*(pose,) * 4, *(surface,) * 2)
-    if preset == "auto":
-        return Schedule(1, 1, 3, (first, second), outline, texture, appearance, heldout, 60, 640)
-    return Schedule(2, 1, 8, (first, second), outline, texture, appearance, heldout, 100, 640)
+Progressed = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -98,11 +44,189 @@ class FitResult:
     """The avatar and what the fit knows about itself. ``table`` rows follow the views given."""
 
     avatar: Avatar
-    table: PoseTable
+    state: FitState
     evidence: Evidence
-    rejected_steps: int
     trimmed: int
     unseen: int
+
+
+@dataclass
+class Trainer:
+    """Runs the steps of a schedule over one state; between two steps the state is all there is."""
+
+    views: list[View]
+    state: FitState
+    camera: Camera
+    schedule: Schedule
+    components: Components
+    seed: int
+    start: HandPose
+    _bindings: dict[tuple[int, int, bool], MeshBinding] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.raster = RasterOptions(cull_backfaces=True)
+        state = self.state
+        self.geometry = GeometryFit(self.views, state.table, state.shape, self.camera, self.seed, self.raster)
+        self.registrar = Registrar(
+            self.views, state.table, state.shape, self.camera, self.raster, shading=self.components.shading
+        )
+        trained = [row for row, view in enumerate(self.views) if not view.heldout]
+        every = self.schedule.validate_every
+        # Too few frames to give any away: then nothing is validated, and nothing stops early.
+        validation = trained[every // 2 :: every] if len(trained) >= 3 * every else []
+        self.scene = Scene(self.views, state.table, state.shape, self.raster, state.gains, validation)
+
+    def bind(self, levels: int, depth: int, widened: bool = False) -> MeshBinding:
+        """A binding of the hand's mesh (kept for the next call)."""
+        key = levels, depth, widened
+        if key not in self._bindings:
+            self._bindings[key] = MeshBinding.build(self.state.shape.model, *key)
+        return self._bindings[key]
+
+    def steps(self) -> list[tuple[str, float, Callable[[Progressed], None]]]:
+        """Name, usual share of the time and work of every step, in order."""
+        s = self.schedule
+        steps: list[tuple[str, float, Callable[[Progressed], None]]] = [
+            (
+                f"stage 1, {early.side} px",
+                early.visits * (60.0**2 + early.side**2),
+                lambda p, turn=early: self._geometry(turn, p),  # type: ignore[misc]
+            )
+            for early in s.geometry
+        ]
+        if s.outline:
+            cost = sum(_cost(turn) for turn in s.outline)
+            steps.append(("stage 1, outline", cost, self._outline))
+        if s.texture:
+            steps.append(("stage 1, sweep", 3 * _cost(SWEEP[-1]), self._sweep))
+        for number, turn in enumerate(s.texture):
+            name = f"stage 1, texture {number + 1}"
+            steps.append((name, 2 * _cost(turn), lambda p, turn=turn: self._texture(turn, p)))  # type: ignore[misc]
+        steps.append(("conversion", 4.0 * s.gather_side**2, self._convert))
+        if s.deforming:
+            cost = sum(_visit_cost(turn) for turn in s.deforming)
+            steps.append(("stage 1, deformation", cost, self._deform))
+        for number, part in enumerate(s.appearance):
+            name = f"stage 2, {part.side} px"
+            steps.append(
+                (name, _visit_cost(part), lambda p, part=part, n=number: self._appearance(part, n, p))  # type: ignore[misc]
+            )
+        if self.scene.validation:
+            steps.append(("stage 2, all frames", 0.3 * _visit_cost(s.appearance[-1]), self._fold_back))
+        if any(view.heldout for view in self.views):
+            steps.append(("held-out poses", sum(_cost(turn) for turn in s.heldout) / 7, self._heldout))
+        return steps
+
+    def run(self, progress: Callable[[float, str], None], checkpoint: Path | None) -> None:
+        """Every step that the state has not behind it."""
+        steps = self.steps()
+        settings = f"{self.schedule} {self.components} {self.seed}"
+        fingerprint = fingerprint_of(self.views, self.start.hand_pose, settings) if checkpoint else ""
+        if checkpoint is not None and self.state.load(checkpoint, fingerprint):
+            self.registrar.light, self.scene.gains = self.state.light, self.state.gains
+            self.registrar.memory = self.state.memory or self.registrar.memory
+            self.state.notes["resumed_after"] = self.state.steps[-1]
+        total, done = sum(share for _, share, _ in steps), 0.0
+        seconds = self.state.notes.setdefault("seconds", {})
+        for number, (name, share, work) in enumerate(steps):
+            if number >= len(self.state.steps):
+                begin, started = done / total, time.perf_counter()
+                progress(begin, name)
+                work(lambda f, b=begin, s=share, n=name: progress(b + s / total * f, n))  # type: ignore[misc]
+                seconds[name] = round(seconds.get(name, 0.0) + time.perf_counter() - started, 2)
+                self.state.steps.append(name)
+                if checkpoint is not None:
+                    self.state.light, self.state.gains = self.registrar.light, self.scene.gains
+                    self.state.memory = self.registrar.memory
+                    self.state.save(checkpoint, fingerprint)
+            done += share
+
+    def _count(self, undone: int) -> None:
+        self.state.notes["undone_steps"] = self.state.notes.get("undone_steps", 0) + undone
+
+    def _geometry(self, turn: GeometryPass, progress: Progressed) -> None:
+        coarse = self.bind(turn.levels, turn.depth)
+        look = Appearance.plain(coarse.count, white_light())
+        if turn.color:
+            skin = Skin.attached(coarse)
+            seen = gather(self.scene, skin, look.light, turn.side, spread(self.scene.trained, 40))
+            look.albedo = fill_unseen(seen, skin, 0.5)
+        before = self.geometry.undone
+        self.geometry.run(turn, coarse, look, progress)
+        self._count(self.geometry.undone - before)
+
+    def _outline(self, progress: Progressed) -> None:
+        coarse = self.bind(1, 0)
+        for done, turn in enumerate(self.schedule.outline):
+            self.registrar.step(turn, coarse, Appearance.plain(coarse.count, self.registrar.light))
+            progress((done + 1) / len(self.schedule.outline))
+
+    def _sweep(self, progress: Progressed) -> None:
+        skin = Skin.attached(self.bind(1, 1))
+        self.registrar.sweep(SWEEP, skin.binding, lambda row: colors_of(self.scene, skin, row), progress)
+
+    def _texture(self, turn: Round, progress: Progressed) -> None:
+        fit, notes = self.registrar, self.state.notes
+        pulls = notes.setdefault("pull_pixels", [])
+        same = [entry for entry in pulls if entry["side"] == turn.side]
+        if len(same) >= 3 and same[-1]["validation"] > (1 - LEAST_FALL) * same[-3]["validation"]:
+            return  # it has stopped falling
+        skin = Skin.attached(self.bind(1, 1))
+        rows = spread(self.scene.trained, REGISTRATION_FRAMES)
+        look = Appearance.plain(skin.count, fit.light)
+        seen = gather(self.scene, skin, fit.light, turn.side, rows, lambda f: progress(0.5 * f))
+        look.albedo = fill_unseen(seen, skin, 0.5)
+        pull = fit.step(turn, skin.binding, look)
+        trained = [row for row, view in enumerate(self.views) if not view.heldout]
+        watched = [trained.index(row) for row in self.scene.validation] or list(range(len(trained)))
+        pulls.append(
+            {
+                "side": turn.side,
+                "training": round(float(pull.mean()), 4),
+                "validation": round(float(pull[watched].mean()), 4),
+            }
+        )
+
+    def _convert(self, progress: Progressed) -> None:
+        convert(
+            self.state, self.scene, self.schedule, self.components, self.bind, self.registrar.light, progress
+        )
+
+    def _fitter(self) -> SurfelFit:
+        weights = SurfelWeights(binding=self.components.binding)
+        return SurfelFit(self.scene, weights, self.components.shading)
+
+    def _deform(self, progress: Progressed) -> None:
+        fitter = self._fitter()
+        deform_surfels(self.state, fitter, self.schedule, self.seed, progress)
+        self._count(fitter.undone)
+
+    def _appearance(self, part: SurfelPass, number: int, progress: Progressed) -> None:
+        fitter = self._fitter()
+        skin, appearance = self.state.surfels()
+        result = fitter.run(skin, appearance, part, self.seed * 1009 + number + 1, progress)
+        self._count(fitter.undone)
+        self.state.notes.setdefault("stage_two", []).append(result.summary(part.side))
+
+    def _fold_back(self, progress: Progressed) -> None:
+        """The validation frames, and as many others, once more at the last pass's final rate."""
+        fitter = self._fitter()
+        skin, appearance = self.state.surfels()
+        rows = [*self.scene.validation, *spread(self.scene.trained, len(self.scene.validation))]
+        last = self.schedule.appearance[-1].folded()
+        fitter.run(skin, appearance, last, self.seed * 1009 + 99, progress, rows)
+        self._count(fitter.undone)
+
+    def _heldout(self, progress: Progressed) -> None:
+        heldout = [row for row, view in enumerate(self.views) if view.heldout]
+        if not self.schedule.heldout:
+            return  # poses are the tracker's, all of them
+        _place_heldout(self.views, self.state.table, self.start)
+        self.registrar.forget(heldout)
+        outline = self.bind(1, 0)
+        for done, turn in enumerate(self.schedule.heldout):
+            self.registrar.step(turn, outline, Appearance.plain(outline.count, self.registrar.light), heldout)
+            progress((done + 1) / len(self.schedule.heldout))
 
 
 def fit_hand(
@@ -113,172 +237,50 @@ def fit_hand(
     schedule: Schedule,
     seed: int,
     progress: Callable[[float, str], None],
+    components: Components | None = None,
+    checkpoint: Path | None = None,
 ) -> FitResult:
     """Fit one hand to ``views`` (in time order) from the poses ``start`` [F] with one shape.
 
     Held-out views give only their silhouette and landmarks, only to their own pose, and only after
-    everything else is finished.
+    everything else is finished. With a ``checkpoint`` file every step is saved there; if the file holds
+    steps of the same fit, it goes on after them, with the same result as if it had never stopped.
     """
     torch.manual_seed(seed)
-    raster = RasterOptions(cull_backfaces=True)
-    table = PoseTable(start)
-    shape = Shape.mean(model, start.betas[0])
-    shares = _shares(schedule)
-    done = 0.0
-
-    def part(share: float, note: str) -> Callable[[float], None]:
-        begin = done
-        return lambda fraction: progress(begin + share * fraction, note)
-
-    geometry = GeometryFit(views, table, shape, camera, seed, raster)
-    bindings: dict[tuple[int, int], MeshBinding] = {}
-
-    def bind(levels: int, depth: int) -> MeshBinding:
-        if (levels, depth) not in bindings:
-            bindings[levels, depth] = MeshBinding.build(model, levels, depth)
-        return bindings[levels, depth]
-
-    for stage, share in zip(schedule.geometry, shares.geometry, strict=True):
-        coarse = bind(stage.levels, stage.depth)
-        look = Appearance.plain(coarse.count, white_light())
-        if stage.color:
-            gatherer = AppearanceFit(views, table, shape, coarse, seed, raster)
-            look.albedo = fill_unseen(gatherer.gather(look.light, stage.side, 40), coarse, 0.5)
-        geometry.run(stage, coarse, look, progress=part(share, f"stage 1 at {stage.side} px"))
-        done += share
-    registrar = Registrar(views, table, shape, camera, raster)
-    with one_thread():  # many small products a frame
-        _register(registrar, schedule, bind, seed, part(shares.registration, "stage 1, registration"))
-    done += shares.registration
-    light = registrar.light
-
-    binding = bind(schedule.levels, schedule.depth)
-    second = AppearanceFit(views, table, shape, binding, seed, raster)
-    evidence = second.gather(light, schedule.gather_side, schedule.gather_frames)
-    appearance = Appearance.plain(binding.count, light, schedule.harmonics)
-    appearance.albedo = fill_unseen(evidence, binding, 0.5)
-    for step, share in zip(schedule.appearance, shares.appearance, strict=True):
-        second.run(appearance, step, progress=part(share, f"stage 2 at {step.side} px"))
-        done += share
-
-    _place_heldout(views, table, start)
-    heldout = [row for row, view in enumerate(views) if view.heldout]
-    if heldout:
-        outline = bind(1, 0)
-        for turn in schedule.heldout:
-            registrar.step(turn, outline, Appearance.plain(outline.count, light), heldout)
-
-    kept = _keep(evidence, binding, model)
-    avatar = Avatar(
-        shape,
-        binding,
-        kept,
-        Appearance(
-            appearance.albedo[kept], appearance.opacity_logits[kept], appearance.sh[kept], appearance.light
-        ),
-        camera,
-        SourceFrames(
-            torch.tensor([view.index for view in views]),
-            torch.tensor([view.heldout for view in views]),
-            table.pose(shape.betas),
-        ),
-        _best_frame(views),
+    state = FitState(
+        PoseTable(start), Shape.mean(model, start.betas[0]), white_light(), torch.ones(len(views), 3)
     )
-    return FitResult(
-        avatar,
-        table,
-        evidence,
-        geometry.rejected_steps + second.rejected_steps,
-        binding.count - len(kept),
-        int((evidence.hand < 0.5).sum()),
+    trainer = Trainer(views, state, camera, schedule, components or Components(), seed, start)
+    with one_thread():  # thousands of small operators; the rasteriser has threads of its own
+        trainer.run(progress, checkpoint)
+    evidence = state.evidence
+    if evidence is None:
+        raise RuntimeError("the fit ended before the conversion")
+    kept, trimmed = finish(state, evidence, trainer.scene)
+    skin, appearance = kept
+    pose = state.table.pose(state.shape.betas)
+    frames = SourceFrames(
+        torch.tensor([view.index for view in views]),
+        torch.tensor([view.heldout for view in views]),
+        pose,
+        trainer.scene.gains,
     )
+    avatar = Avatar(state.shape, skin, appearance, camera, frames, _best_frame(views))
+    return FitResult(avatar, state, evidence, trimmed, int((evidence.hand < 0.5).sum()))
 
 
-def _register(
-    registrar: Registrar,
-    schedule: Schedule,
-    bind: Callable[[int, int], MeshBinding],
-    seed: int,
-    progress: Callable[[float], None],
-) -> None:
-    """Registration by outline, then, when texture takes part, a sweep and registration with it."""
-    total = len(schedule.outline) + 2 * len(schedule.texture) + 4
-    fit = registrar
-    coarse = bind(1, 0)
-    for done, turn in enumerate(schedule.outline):
-        fit.step(turn, coarse, Appearance.plain(coarse.count, fit.light))
-        progress((done + 1) / total)
-    if not schedule.texture:
-        return
-    fine = bind(1, 1)
-    gatherer = AppearanceFit(fit.views, fit.table, fit.shape, fine, seed, fit.raster)
-    fit.sweep(SWEEP, fine, gatherer.colors_of)
-    for done, turn in enumerate(schedule.texture):
-        progress((len(schedule.outline) + 4 + 2 * done) / total)
-        look = Appearance.plain(fine.count, fit.light)
-        look.albedo = fill_unseen(gatherer.gather(fit.light, turn.side, REGISTRATION_FRAMES), fine, 0.5)
-        fit.step(turn, fine, look)
+def _cost(turn: Round) -> float:
+    return 3.0 * (60.0**2 + turn.side**2)
 
 
-@dataclass(frozen=True)
-class _Shares:
-    geometry: list[float]
-    registration: float
-    appearance: list[float]
-
-
-def _shares(schedule: Schedule) -> _Shares:
-    """How the time divides over the passes: by pixels and visits, with a constant part a step."""
-    first = [stage.visits * (60.0**2 + stage.side**2) for stage in schedule.geometry]
-    turns = [3.0 * (60.0**2 + turn.side**2) for turn in (*schedule.outline, *schedule.texture)]
-    second = [stage.visits * 2 * (60.0**2 + stage.side**2) for stage in schedule.appearance]
-    total = sum(first) + sum(turns) + sum(second)
-    return _Shares(
-        [value / total for value in first], sum(turns) / total, [value / total for value in second]
-    )
-
-
-def _keep(evidence: Evidence, binding: MeshBinding, model: HandModel) -> Tensor:
-    """Surfels to keep: the hand ends where the clip shows it to end (a sleeve, a watch, the frame).
-
-    Around the wrist a plane is put between what was seen as hand and what was seen as forearm or background
-    (logistic regression on rest positions, weighted by evidence); all beyond it goes, seen or not.
-    """
-    with torch.no_grad():
-        places = binding.surfels(model.template).means
-    along = places[:, 0] - model.joint_template[0, 0]
-    along = along if model.side == "right" else -along  # the forearm's axis, outward
-    wrist = along > -WRIST_REACH
-    hand = evidence.hand[wrist]
-    other = (FOREARM_WEIGHT * evidence.ignored + BACKGROUND_WEIGHT * evidence.background)[wrist]
-    if float(other.sum()) < 0.01 * float(hand.sum()):
-        return torch.arange(binding.count)
-    centered = (places[wrist] - places[wrist].mean(0)) / (2 * WRIST_REACH)
-    plane = torch.zeros(4, requires_grad=True)
-    optimizer = torch.optim.LBFGS([plane], max_iter=60, line_search_fn="strong_wolfe")
-    total = (hand + other).sum()
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        score = 20 * (centered @ plane[:3] + plane[3])
-        softplus = torch.nn.functional.softplus
-        loss = (hand * softplus(-score) + other * softplus(score)).sum() / total + 1e-3 * plane.square().sum()
-        loss.backward()
-        return loss
-
-    optimizer.step(closure)
-    with torch.no_grad():
-        keep = torch.ones(binding.count, dtype=torch.bool)
-        keep[wrist] = centered @ plane[:3] + plane[3] > 0
-    return keep.nonzero()[:, 0]
+def _visit_cost(turn: SurfelPass) -> float:
+    return turn.visits * 2 * (60.0**2 + turn.side**2)
 
 
 def _place_heldout(views: list[View], table: PoseTable, start: HandPose) -> None:
     """Start each held-out pose between its neighbours' refined poses."""
     trained = [row for row, view in enumerate(views) if not view.heldout]
     heldout = [row for row, view in enumerate(views) if view.heldout]
-    if not heldout:
-        return
     rows = torch.tensor(trained)
     known = HandPose(
         start.betas[rows],

@@ -44,6 +44,27 @@ class Level:
 
 
 @dataclass(frozen=True)
+class _Packed:
+    """A level in bytes, as it is kept: hundreds of frames in floats would fill the memory."""
+
+    rgb: NDArray[np.uint8]
+    hand: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    colored: NDArray[np.bool_]
+    camera: Camera
+
+    def level(self) -> Level:
+        """Unpacked."""
+        return Level(
+            torch.from_numpy(self.rgb).float().div_(255),
+            torch.from_numpy(self.hand).float().div_(255),
+            torch.from_numpy(self.valid).float(),
+            torch.from_numpy(self.colored).float(),
+            self.camera,
+        )
+
+
+@dataclass(frozen=True)
 class Outline:
     """``points`` [C,2]: where hand meets background, in pixels of the crop. ``outside`` [1,1,h,w]: distance
     in pixels from each pixel to the nearest one that is hand or ignored."""
@@ -67,7 +88,7 @@ class View:
     score: float
     at_joints: bool = False  # the points are a model's joints, not the tracker's
     coverage: NDArray[np.float32] | None = None
-    _levels: dict[int, Level] = field(default_factory=dict, repr=False)
+    _levels: dict[int, _Packed] = field(default_factory=dict, repr=False)
     _outline: Outline | None = field(default=None, repr=False)
 
     def level(self, side: int) -> Level:
@@ -75,7 +96,7 @@ class View:
         side = min(side, max(self.labels.shape))  # nothing is enlarged: all larger sides are one level
         if side not in self._levels:
             self._levels[side] = self._reduce(side)
-        return self._levels[side]
+        return self._levels[side].level()
 
     def outline(self) -> Outline:
         """The hand's outline and the distances outside it (kept for the next call)."""
@@ -83,7 +104,7 @@ class View:
             self._outline = _trace(self.labels)
         return self._outline
 
-    def _reduce(self, side: int) -> Level:
+    def _reduce(self, side: int) -> _Packed:
         height, width = self.labels.shape
         scale = min(1.0, side / max(height, width))
         w, h = max(1, round(width * scale)), max(1, round(height * scale))
@@ -97,11 +118,11 @@ class View:
             hand, ignore, near = (
                 cv2.resize(m, (w, h), interpolation=cv2.INTER_AREA) for m in (hand, ignore, near)
             )
-        return Level(
-            torch.from_numpy(rgb.astype(np.float32) / 255),
-            torch.from_numpy(hand),
-            torch.from_numpy((ignore < 0.5).astype(np.float32)),
-            torch.from_numpy((near < 0.1).astype(np.float32)),
+        return _Packed(
+            rgb,
+            np.rint(hand * 255).astype(np.uint8),
+            ignore < 0.5,
+            near < 0.1,
             self.camera.resized(w, h),
         )
 

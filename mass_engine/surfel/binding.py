@@ -17,6 +17,10 @@ from mass_engine.surfel.inellipse import (
 )
 from mass_engine.surfel.subdivision import Subdivision, loop_subdivision
 
+#: A face's one surfel, this much larger than its inellipse, leaves no gaps at the corners: two neighbours
+#: cover an edge's midpoint to 0.97, six a corner to 0.99.
+WIDENED = 1.5
+
 
 @dataclass(frozen=True)
 class AttachedSurfels:
@@ -40,7 +44,9 @@ class MeshBinding:
     """Built once for a hand model, ``levels`` of Loop subdivision and a fractal ``depth``.
 
     Surfel n belongs to face ``surfel_faces[n]`` of the base mesh (``base_faces`` [F,3]) and moves mostly with
-    bone ``bones[n]``. Surfels of one refined face are neighbours: n = face * per_face + place.
+    bone ``bones[n]``. Surfels of one refined face are neighbours: n = face * per_face + place. Place 0 is the
+    inellipse of the whole face. With ``widened`` the last place is that one WIDENED times as large, to stand
+    for all of the face's surfels.
     """
 
     levels: int
@@ -50,21 +56,26 @@ class MeshBinding:
     per_face: int
     surfel_faces: Tensor
     bones: Tensor
+    widened: bool
     _parts: Tensor  # [9,9 K]: a face's corners (flat) to mean and tangents of each of its small triangles
 
     @staticmethod
-    def build(model: HandModel, levels: int, depth: int) -> MeshBinding:
+    def build(model: HandModel, levels: int, depth: int, widened: bool = False) -> MeshBinding:
         """Precompute everything that does not depend on the pose."""
         subdivision = loop_subdivision(model.faces, len(model.template), levels)
         corners = fractal_corners(depth)
         conjugate = torch.tensor(CONJUGATE)
         conjugate[1:] *= SIGMA_PER_SEMI_AXIS
         # Tangent order (Q, P): their cross product is the outward normal.
-        rows = (conjugate[[0, 2, 1]] @ corners).reshape(-1, 3)
+        places = conjugate[[0, 2, 1]] @ corners
+        if widened:
+            wide = places[:1] * torch.tensor([1.0, WIDENED, WIDENED])[:, None]
+            places = torch.cat([places, wide])
+        rows = places.reshape(-1, 3)
         parts = torch.kron(rows.T.contiguous(), torch.eye(3))
         weights = subdivision.apply(model.weights)
         bones = weights[subdivision.faces].mean(1).argmax(-1)
-        count = len(corners)
+        count = len(places)
         return MeshBinding(
             levels,
             depth,
@@ -73,6 +84,7 @@ class MeshBinding:
             count,
             subdivision.face_parent.repeat_interleave(count),
             bones.repeat_interleave(count),
+            widened,
             parts,
         )
 

@@ -13,6 +13,7 @@ _GAIN = 2.0  # lens, codec and chroma make an edge in a video this much wider th
 # Where between the colours on both sides a half covered pixel lies: a hand turns away at its edge, which is
 # less like its inside for that (0.1 pixel on rendered clips).
 _HALF = 0.46
+_WHOLE = 0.85  # share of hand from which a pixel beside a sleeve shows the hand's colour
 _BAND = 1.6  # pixels from the final edge beyond which coverage is whole or nothing
 
 
@@ -35,6 +36,37 @@ def refine_edge(
     window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     out = hand.astype(np.float32)
     out[window] = _matte(rgb[window], rough[window], edge[window], ignore[window], sure, reach)
+    return out
+
+
+def refine_seam(
+    rgb: NDArray[np.uint8], hand: NDArray[np.bool_], ignore: NDArray[np.bool_], blur: float
+) -> NDArray[np.bool_]:
+    """Pixels [h,w] of ``hand`` that belong to what is ignored beside it (a sleeve), by their colour.
+
+    Within twice ``blur`` pixels of ``ignore`` each pixel of the hand is laid on the line between the mean
+    colours of both sides, as in :func:`refine_edge`. What is not nearly all hand goes; where the sides are
+    alike (a bare forearm), nothing does.
+    """
+    out = np.zeros_like(hand)
+    sure, reach = max(_SURE, 1.2 * blur), max(_REACH, 4.0 * blur)
+    away = cv2.distanceTransform((~ignore).astype(np.uint8), cv2.DIST_L2, 3)
+    # Pixels at the outline are mixed with the background, and softly so: they stay.
+    rest = cv2.distanceTransform((hand | ignore).astype(np.uint8), cv2.DIST_L2, 3)
+    rows, columns = np.nonzero(hand & (away <= 2.0 * sure) & (rest > sure))
+    if len(rows) == 0:
+        return out
+    skin = hand & (away > 2.0 * sure) & (away < 3.0 * reach)
+    means = (_local_mean(rgb, side, 1.5 * reach) for side in (skin, ignore))
+    fore, back = (
+        mean[np.minimum(rows // 2, mean.shape[0] - 1), np.minimum(columns // 2, mean.shape[1] - 1)]
+        for mean in means
+    )
+    line = fore[:, :3] - back[:, :3]
+    contrast = (line * line).sum(1)
+    place = ((rgb[rows, columns] - back[:, :3]) * line).sum(1) / np.maximum(contrast, 1.0)
+    known = (np.minimum(fore[:, 3], back[:, 3]) > 0.01) & (contrast > (2 * _CONTRAST) ** 2)
+    out[rows, columns] = known & (place < _WHOLE)
     return out
 
 

@@ -22,7 +22,7 @@ from mass_engine.tracking.hand_colors import (
     strange_colors,
 )
 from mass_engine.tracking.landmarks import HandLandmarks
-from mass_engine.tracking.matting import refine_edge
+from mass_engine.tracking.matting import refine_edge, refine_seam
 
 BACKGROUND, IGNORE, HAND = 0, 128, 255
 
@@ -185,6 +185,8 @@ class HandSegmenter:
         coverage = refine_edge(rgb[y : y + h, x : x + w], soft, arm, w / mask.shape[1])
         labels = np.where(coverage > 0.5, HAND, BACKGROUND).astype(np.uint8)
         labels[arm & (soft <= 0.5)] = IGNORE
+        seam = refine_seam(rgb[y : y + h, x : x + w], labels == HAND, labels == IGNORE, w / mask.shape[1])
+        labels[seam] = IGNORE
         coverage[labels == IGNORE] = 0.0
         return HandMask(window.box, labels, coverage)
 

@@ -6,6 +6,7 @@ import torch
 
 from mass_engine.avatar import Avatar, SourceFrames
 from mass_engine.camera import Camera
+from mass_engine.fitting.skin import Skin
 from mass_engine.fitting.subject import Appearance, Shape
 from mass_engine.hand.builtin import load_builtin
 from mass_engine.hand.pose import HandPose
@@ -28,7 +29,7 @@ def small_avatar() -> Avatar:
         torch.tensor([[0.0, 0.08, 0.4]]),
         "right",
     )
-    frames = SourceFrames(torch.tensor([0]), torch.tensor([False]), pose)
+    frames = SourceFrames(torch.tensor([0]), torch.tensor([False]), pose, torch.ones(1, 3))
     camera = Camera.from_fov(160, 120, 50.0)
-    kept = torch.arange(count)
-    return Avatar(Shape.mean(model, torch.zeros(10)), binding, kept, appearance, camera, frames, 0)
+    skin = Skin.attached(binding)
+    return Avatar(Shape.mean(model, torch.zeros(10)), skin, appearance, camera, frames, 0)

@@ -16,15 +16,16 @@ def colorful() -> Avatar:
     """The small avatar with part of its surfels, and every kind of colour."""
     avatar = small_avatar()
     generator = torch.Generator().manual_seed(4)
-    kept = torch.arange(0, avatar.binding.count, 3)
-    count = len(kept)
+    kept = torch.zeros(avatar.skin.count, dtype=torch.bool)
+    kept[::3] = True
+    count = int(kept.sum())
     look = Appearance(
         torch.rand(count, 3, generator=generator),
         torch.randn(count, generator=generator) + 2,
         torch.randn(count, 8, 3, generator=generator) * 0.1,
         avatar.appearance.light + torch.randn(9, 3, generator=generator) * 0.1,
     )
-    return replace(avatar, kept=kept, appearance=look)
+    return replace(avatar, skin=avatar.skin.pick(kept, avatar.shape.model), appearance=look)
 
 
 def test_the_compiled_picture_is_the_one_the_fit_sees() -> None:
@@ -33,7 +34,7 @@ def test_the_compiled_picture_is_the_one_the_fit_sees() -> None:
     for spec in ("fist", "frame:0"):
         pose = avatar.resolve_pose(spec)
         got = avatar.render_pose(pose, avatar.camera, options)
-        bones = avatar.binding.bones[avatar.kept]
+        bones = avatar.skin.bones
         expected = render_row(avatar.appearance, avatar.posed(pose), 0, bones, avatar.camera, options)
         assert float(expected.alpha.max()) > 0.9
         # A surfel at its alpha cut may be blended in one and not in the other: one part in 255.

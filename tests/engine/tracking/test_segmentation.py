@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mass_engine.tracking import capsules
+from mass_engine.tracking.matting import refine_seam
 from mass_engine.tracking.models import HandNetworks
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE, HandSegmenter, hand_box
 from mass_engine.tracking.track import track_main_hand
@@ -211,3 +212,16 @@ def test_a_thing_over_the_hand_is_ignored_and_the_hand_around_it_is_not() -> Non
         clear = above & (cv2.dilate(hides.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0)
         assert iou(np.where(clear, labels, IGNORE).astype(np.uint8), truth) > 0.9
         assert (labels[truth & clear] == IGNORE).mean() < 0.03
+
+
+def test_next_to_a_sleeve_what_has_its_colour_is_not_hand() -> None:
+    image = np.full((60, 80, 3), CLOTH, np.uint8)
+    image[:30] = SKIN
+    image[30] = (np.array(SKIN) + np.array(CLOTH)) // 2  # a pixel of both
+    hand = np.zeros((60, 80), bool)
+    hand[:33] = True  # three rows too far
+    seam = refine_seam(image, hand, ~hand, 1.0)
+    assert (seam[30:33, 5:-5]).all()
+    assert not seam[:30].any()
+    bare = np.full((60, 80, 3), SKIN, np.uint8)
+    assert not refine_seam(bare, hand, ~hand, 1.0).any(), "a bare forearm has the hand's colour"

@@ -1,0 +1,117 @@
+"""The surfels of a fit: which of a binding's are attached, which detached, and what moves these."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mass_engine.deform.network import Deformation, DeformationConfig, UnitCube
+from mass_engine.deform.residuals import deform
+from mass_engine.fitting.subject import PosedSurfels, Shape, pose_surfels
+from mass_engine.hand.model import HandModel
+from mass_engine.hand.pose import HandPose
+from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
+
+
+@dataclass
+class Skin:
+    """M surfels of ``binding``: ``sources`` [M] says whose copy each is; attached ones come first, those from
+    ``detached_from`` on are detached. ``deformation`` has a row for each detached one."""
+
+    binding: MeshBinding
+    sources: Tensor
+    detached_from: int
+    deformation: Deformation | None = None
+
+    @staticmethod
+    def attached(binding: MeshBinding) -> Skin:
+        """Every surfel of the binding but the widened ones, none detached."""
+        every = torch.arange(binding.count)
+        if binding.widened:
+            every = every[every % binding.per_face != binding.per_face - 1]
+        return Skin(binding, every, len(every))
+
+    def with_detached(self, sources: Tensor) -> Skin:
+        """Detached copies of the surfels ``sources`` [D] of the binding after the attached ones."""
+        attached = self.sources[: self.detached_from]
+        return Skin(self.binding, torch.cat([attached, sources]), len(attached))
+
+    @property
+    def count(self) -> int:
+        """M."""
+        return len(self.sources)
+
+    @property
+    def detached(self) -> Tensor:
+        """Sources [D] of the detached surfels."""
+        return self.sources[self.detached_from :]
+
+    @property
+    def bones(self) -> Tensor:
+        """The bone each surfel follows [M]."""
+        return self.binding.bones[self.sources]
+
+    @property
+    def faces(self) -> Tensor:
+        """The face of the base mesh each surfel belongs to [M]."""
+        return self.binding.surfel_faces[self.sources]
+
+    def new_deformation(self, model: HandModel, config: DeformationConfig, seed: int) -> Deformation:
+        """An untrained deformation of the detached surfels: the identity."""
+        with torch.no_grad():
+            centroids = self.binding.surfels(model.template).means[self.detached]
+        return Deformation(
+            config,
+            centroids,
+            self.binding.surfel_faces[self.detached],
+            len(self.binding.base_faces),
+            UnitCube.around(model.template),
+            torch.Generator().manual_seed(seed),
+        )
+
+    def pick(self, kept: Tensor, model: HandModel) -> Skin:
+        """Only the surfels ``kept`` (bool [M])."""
+        attached = int(kept[: self.detached_from].sum())
+        picked = Skin(self.binding, self.sources[kept], attached, self.deformation)
+        if picked.deformation is not None:
+            with torch.no_grad():
+                centroids = self.binding.surfels(model.template).means[picked.detached]
+            picked.deformation.place(centroids, self.binding.surfel_faces[picked.detached])
+        return picked
+
+    def pose(self, shape: Shape, pose: HandPose) -> PosedSurfels:
+        """The surfels of a batch of poses [B]; differentiable in the deformation alone."""
+        with torch.no_grad():
+            every = pose_surfels(shape, self.binding, pose)
+            surfels = every.attached
+            if self.count != self.binding.count or self.detached_from < self.count:
+                surfels = AttachedSurfels(
+                    surfels.means[:, self.sources],
+                    surfels.tangents[:, self.sources],
+                    surfels.normals[:, self.sources],
+                )
+        if self.deformation is None:
+            return PosedSurfels(surfels, every.outline_vertices, every.bone_rotations, every.joints)
+        start = self.detached_from
+        residuals = self.deformation(pose.hand_pose, pose.betas)
+        parts = (surfels.means, surfels.tangents, surfels.normals)
+        moved = deform(AttachedSurfels(*(part[:, start:] for part in parts)), residuals)
+        both = zip(parts, (moved.means, moved.tangents, moved.normals), strict=True)
+        mask = torch.cat([torch.ones(len(residuals.mask), start), residuals.mask], 1)
+        return PosedSurfels(
+            AttachedSurfels(*(torch.cat([part[:, :start], new], 1) for part, new in both)),
+            every.outline_vertices,
+            every.bone_rotations,
+            every.joints,
+            mask,
+            residuals,
+        )
+
+    def triangles(self, refined: Tensor) -> Tensor:
+        """The refined mesh's faces [B,D,3 corners,3] that the detached surfels come from."""
+        faces = self.binding.subdivision.faces[
+            torch.div(self.detached, self.binding.per_face, rounding_mode="floor")
+        ]
+        return refined[:, faces]

@@ -52,8 +52,8 @@ class FitState:
             raise RuntimeError("the mesh has not been converted yet")
         return self.skin, self.appearance
 
-    def save(self, path: Path, fingerprint: str) -> None:
-        """Write everything to ``path`` in one step."""
+    def save(self, path: Path, fingerprints: tuple[str, str]) -> None:
+        """Write all of it to ``path`` in one step; ``fingerprints``: of the registration, of the whole fit."""
         tensors = {f"table.{name}": value for name, value in self.table.values.items()}
         tensors |= {
             "shape.betas": self.shape.betas,
@@ -62,7 +62,7 @@ class FitState:
             "gains": self.gains,
         }
         tensors |= {f"memory.{name}": value for name, value in self.memory.items()}
-        metadata: dict[str, Any] = {"fingerprint": fingerprint, "steps": self.steps, "notes": self.notes}
+        metadata: dict[str, Any] = {"fingerprints": fingerprints, "steps": self.steps, "notes": self.notes}
         if self.appearance is not None and self.skin is not None:
             tensors |= {f"appearance.{name}": getattr(self.appearance, name) for name in _APPEARANCE}
             tensors["skin.sources"] = self.skin.sources
@@ -80,14 +80,19 @@ class FitState:
         save_file(copies, partial, {"state": json.dumps(metadata)})
         os.replace(partial, path)
 
-    def load(self, path: Path, fingerprint: str) -> bool:
-        """Take over the checkpoint at ``path``; False, and nothing changed, if it is none of this fit."""
+    def load(self, path: Path, fingerprints: tuple[str, str]) -> bool:
+        """Take over the checkpoint at ``path``; False, and nothing changed, if it is none of this fit.
+
+        Before the conversion to surfels it is enough that the registration is the same.
+        """
         if not path.is_file():
             return False
         try:
             with safe_open(path, framework="pt") as file:
                 metadata = json.loads((file.metadata() or {})["state"])
-                if metadata["fingerprint"] != fingerprint:
+                registration, whole = metadata["fingerprints"]
+                early = "binding" not in metadata and registration == fingerprints[0]
+                if not early and whole != fingerprints[1]:
                     return False
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no dict
         except (SafetensorError, KeyError, ValueError, OSError):

@@ -120,9 +120,8 @@ class Trainer:
     def run(self, progress: Callable[[float, str], None], checkpoint: Path | None) -> None:
         """Every step that the state has not behind it."""
         steps = self.steps()
-        settings = f"{self.schedule} {self.components} {self.seed}"
-        fingerprint = fingerprint_of(self.views, self.start.hand_pose, settings) if checkpoint else ""
-        if checkpoint is not None and self.state.load(checkpoint, fingerprint):
+        prints = self._fingerprints() if checkpoint is not None else ("", "")
+        if checkpoint is not None and self.state.load(checkpoint, prints):
             self.registrar.light, self.scene.gains = self.state.light, self.state.gains
             self.registrar.memory = self.state.memory or self.registrar.memory
             self.state.notes["resumed_after"] = self.state.steps[-1]
@@ -138,8 +137,15 @@ class Trainer:
                 if checkpoint is not None:
                     self.state.light, self.state.gains = self.registrar.light, self.scene.gains
                     self.state.memory = self.registrar.memory
-                    self.state.save(checkpoint, fingerprint)
+                    self.state.save(checkpoint, prints)
             done += share
+
+    def _fingerprints(self) -> tuple[str, str]:
+        """Of what the registration depends on, and of everything."""
+        s, parts = self.schedule, self.components
+        early = f"{s.geometry} {s.outline} {s.texture} {s.validate_every} {parts.shading} {self.seed}"
+        start = fingerprint_of(self.views, self.start.hand_pose, early)
+        return start, fingerprint_of([], self.start.hand_pose, f"{start} {s} {parts}")
 
     def _count(self, undone: int) -> None:
         self.state.notes["undone_steps"] = self.state.notes.get("undone_steps", 0) + undone

@@ -53,7 +53,7 @@ class FitState:
         return self.skin, self.appearance
 
     def save(self, path: Path, fingerprints: tuple[str, str]) -> None:
-        """Write all of it to ``path`` in one step; ``fingerprints``: of the registration, of the whole fit."""
+        """Write it to ``path`` in one step; ``fingerprints``: of the registration, and of the whole fit."""
         tensors = {f"table.{name}": value for name, value in self.table.values.items()}
         tensors |= {
             "shape.betas": self.shape.betas,

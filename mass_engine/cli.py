@@ -115,7 +115,7 @@ def build_parser() -> argparse.ArgumentParser:
     export.set_defaults(run=_export)
 
     bench = commands.add_parser("bench", help="measure speed on this machine")
-    bench.add_argument("what", choices=("raster", "render"))
+    bench.add_argument("what", choices=("raster", "render", "fit"))
     bench.add_argument("rest", nargs=argparse.REMAINDER)
     bench.set_defaults(run=_bench)
     return parser
@@ -262,6 +262,10 @@ def _bench(arguments: argparse.Namespace) -> None:
         from mass_engine.evaluation import bench_raster
 
         bench_raster.run(arguments.rest)
+    elif arguments.what == "fit":
+        from mass_engine.evaluation import bench_fit
+
+        bench_fit.run(arguments.rest)
     else:
         from mass_engine.evaluation import bench_render
 

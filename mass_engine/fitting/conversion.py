@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -26,7 +27,7 @@ WRIST_REACH = 0.03
 #: that slides shows in one frame what it hides in another: the hand ends where it was never seen.
 BACKGROUND_WEIGHT, FOREARM_WEIGHT = 0.2, 0.004
 #: Hash levels tried, fewest first; each more only if it gains.
-HASH_LEVELS = (5, 8)
+HASH_LEVELS = (2, 6)
 #: Rounds of frame gains and the colours under them.
 GAIN_ROUNDS = 2
 #: Surfels under this opacity in every frame are nothing.
@@ -92,44 +93,40 @@ def deform_surfels(
 ) -> None:
     """Stage one's last part: the detached surfels leave the mesh, if the validation frames gain by it.
 
-    An adaptive schedule tries the coarse hash grid first and gives up what does not pay; others take the
-    finest.
+    An adaptive schedule tries without them, then with ever more hash levels, and takes the least that gains;
+    others take the finest.
     """
     skin, appearance = state.surfels()
+    choose = schedule.adaptive and bool(fitter.scene.validation)
+    levels = (0, *HASH_LEVELS) if choose else HASH_LEVELS[-1:]
     tried: list[dict[str, float]] = []
-    state.notes["deformation"] = tried
-    best: tuple[float, Skin, Appearance] | None = None
-    levels = HASH_LEVELS if schedule.adaptive and fitter.scene.validation else HASH_LEVELS[-1:]
-    start = fitter.validation(*_without_detached(skin, appearance), schedule.deforming[0].side)
+    best = (-math.inf, 0, skin, appearance)
     for number, count in enumerate(levels):
-        config = DeformationConfig(HashGridConfig(levels=count))
-        trial = replace(
-            skin, deformation=skin.new_deformation(state.shape.model, config, seed * 1009 + count)
-        )
-        look = _copy(appearance)
-        reached = start
+        moved, look = _candidate(state, skin, appearance, count, seed)
+        reached = math.nan
         for turn, stage in enumerate(schedule.deforming):
-            result = fitter.run(
-                trial,
-                look,
-                stage,
-                seed * 1009 + 50 + turn,
-                lambda f, n=number: progress((n + f) / len(levels)),  # type: ignore[misc]
-            )
-            reached = result.after
-        tried.append({"hash_levels": count, "before": round(start, 3), "after": round(reached, 3)})
-        floor = start if best is None else best[0]
-        if schedule.adaptive and not reached >= floor + capacity.DEFORMATION_GAIN:
+            reached = fitter.run(moved, look, stage, seed * 1009 + 50 + turn).after
+        progress((number + 1) / len(levels))
+        tried.append({"hash_levels": count, "validation": round(reached, 3)})
+        if choose and number and not reached >= best[0] + capacity.DEFORMATION_GAIN:
             break
-        best = (reached, trial, look)
-    if best is not None:
-        state.skin, state.appearance = best[1], best[2]
-    else:
-        count = skin.detached_from
-        state.skin, state.appearance = _without_detached(skin, appearance)
-        if state.evidence is not None:
-            state.evidence = _rows(state.evidence, torch.arange(count))
+        best = (reached, count, moved, look)
+    _, count, state.skin, state.appearance = best
+    if count == 0 and state.evidence is not None:
+        state.evidence = _rows(state.evidence, torch.arange(state.skin.count))
+    state.notes["deformation"] = {"tried": tried, "hash_levels": count}
     state.notes["capacity"]["detached"] = len(state.skin.detached)
+
+
+def _candidate(
+    state: FitState, skin: Skin, appearance: Appearance, levels: int, seed: int
+) -> tuple[Skin, Appearance]:
+    """Copies to try: with a deformation of so many hash levels, or (0) without detached surfels."""
+    if levels == 0:
+        return _without_detached(skin, appearance)
+    config = DeformationConfig(HashGridConfig(levels=levels))
+    moved = replace(skin, deformation=skin.new_deformation(state.shape.model, config, seed * 1009 + levels))
+    return moved, _copy(appearance)
 
 
 def finish(state: FitState, evidence: Evidence, scene: Scene) -> tuple[tuple[Skin, Appearance], int]:

@@ -19,12 +19,12 @@ def photometric(rgb: Tensor, target: Tensor, valid: Tensor, area: Tensor) -> Ten
     return (charbonnier(rgb - target, 0.01).mean(-1) * valid).sum() / area
 
 
-def silhouette(alpha: Tensor, hand: Tensor, valid: Tensor, area: Tensor) -> Tensor:
+def silhouette(alpha: Tensor, hand: Tensor, valid: Tensor, area: Tensor, holes: float = 1.0) -> Tensor:
     """|alpha - hand| over the valid pixels, per pixel of hand area: paper's L_sil with ignore regions.
 
-    A hole in the hand counts double: it shows the background, what sticks out shows skin.
+    A hole in the hand counts ``holes`` more than what sticks out.
     """
-    return (charbonnier(alpha - hand, 0.05) * valid * (1 + hand)).sum() / area
+    return (charbonnier(alpha - hand, 0.05) * valid * (1 + holes * hand)).sum() / area
 
 
 def outline_distance(vertices: Tensor, points: Tensor, outside: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ HAND_SIZE = 0.18
 @dataclass(frozen=True)
 class SurfelPass:
     """One resolution. ``visits`` of all frames at most; ``geometry`` moves the detached surfels, otherwise
-    opacities and their mask are free; ``harmonics`` frees the view-dependent colour."""
+    their opacity mask is free; ``harmonics`` frees the view-dependent colour."""
 
     side: int
     visits: int
@@ -63,7 +63,7 @@ class SurfelWeights:
 
 @dataclass(frozen=True)
 class PassResult:
-    """Visits made, validation PSNR in the mask before and after (dB; NaN without validation frames)."""
+    """Visits made, validation PSNR before and after (dB; NaN without validation frames)."""
 
     visits: int
     before: float
@@ -111,6 +111,7 @@ class SurfelFit:
         guard = Guard(parameters)
         before = latest = self.validation(skin, appearance, stage.side)
         visits = 1 if rows else stage.visits
+        kept = [value.detach().clone() for value in parameters]
         visit = 0
         while visit < visits:
             order = torch.randperm(len(trained), generator=random).tolist()
@@ -130,9 +131,14 @@ class SurfelFit:
             visit += 1
             reached = self.validation(skin, appearance, stage.side)
             if rows is None and reached < latest + LEAST_GAIN:
-                latest = reached
+                if reached < latest:
+                    with torch.no_grad():  # back to where validation was best
+                        for value, good in zip(parameters, kept, strict=True):
+                            value.copy_(good)
+                latest = max(latest, reached)
                 break
             latest = reached
+            kept = [value.detach().clone() for value in parameters]
         self.undone += guard.undone
         for value in parameters:
             value.requires_grad_(False)
@@ -140,17 +146,20 @@ class SurfelFit:
         return PassResult(visit, before, latest)
 
     def validation(self, skin: Skin, appearance: Appearance, side: int) -> float:
-        """Mean PSNR in the mask of the validation frames (NaN: there are none)."""
+        """Mean PSNR of the validation frames (NaN: there are none), hand over black.
+
+        The error is summed over all valid pixels and divided by the hand's area: what sticks out costs as
+        much as a hole. Inside the mask alone, a fatter hand would always be a better one.
+        """
         values = []
         for row in self.scene.validation:
             with torch.no_grad():
                 level = self.scene.views[row].level(side)
-                out = self._render(skin, appearance, level, row)[0]
-                inside = level.colored * (level.hand > 0.5)
-                squared = (out.rgb.clamp(0, 1) - level.rgb).square().mean(-1) * inside
-                values.append(
-                    float(-10 * (squared.sum() / inside.sum().clamp_min(1)).clamp_min(1e-8).log10())
-                )
+                rgb = self._render(skin, appearance, level, row)[1]
+                usable = torch.where(level.hand > 0.5, level.colored, level.valid)
+                squared = (rgb.clamp(0, 1) - level.rgb * level.hand.unsqueeze(-1)).square().mean(-1) * usable
+                area = (level.hand * level.colored).sum().clamp_min(1)
+                values.append(float(-10 * (squared.sum() / area).clamp_min(1e-8).log10()))
         return sum(values) / len(values) if values else float("nan")
 
     def _render(
@@ -193,7 +202,7 @@ class SurfelFit:
             window = level.hand_window()
             structure = losses.dssim(rgb[window], target[window], inside[window])
             loss = (1 - stage.dssim) * loss + stage.dssim * 2 * structure
-        loss = loss + w.silhouette * losses.silhouette(out.alpha, level.hand, level.valid, area)
+        loss = loss + w.silhouette * losses.silhouette(out.alpha, level.hand, level.valid, area, holes=0.0)
         if not stage.geometry:
             return loss
         if options is not None:
@@ -238,7 +247,7 @@ def _groups(
     skin: Skin, appearance: Appearance, stage: SurfelPass, shading: bool
 ) -> Iterator[tuple[float, Tensor]]:
     """Learning rate and tensor of everything that the pass moves."""
-    names = ["albedo"] + (["light"] if shading else []) + ([] if stage.geometry else ["opacity_logits"])
+    names = ["albedo", "opacity_logits"] + (["light"] if shading else [])
     if stage.harmonics and appearance.sh.shape[1] > 0:
         names.append("sh")
     for name in names:

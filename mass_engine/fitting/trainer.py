@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from mass_engine.avatar import Avatar, SourceFrames
 from mass_engine.camera import Camera
@@ -35,6 +36,11 @@ from mass_engine.tracking.alignment import interpolate_pose
 REGISTRATION_FRAMES = 100
 #: Registration ends when the validation frames' pull falls by less than this share in two rounds.
 LEAST_FALL = 0.01
+
+#: Loop levels and fractal depth of the surfels that texture is registered with.
+REGISTERED = (1, 1)
+#: Rounds in which the surface settles under surfels of another resolution.
+SETTLING = 2
 
 Progressed = Callable[[float], None]
 
@@ -168,21 +174,15 @@ class Trainer:
             progress((done + 1) / len(self.schedule.outline))
 
     def _sweep(self, progress: Progressed) -> None:
-        skin = Skin.attached(self.bind(1, 1))
+        skin = Skin.attached(self.bind(*REGISTERED))
         self.registrar.sweep(SWEEP, skin.binding, lambda row: colors_of(self.scene, skin, row), progress)
 
     def _texture(self, turn: Round, progress: Progressed) -> None:
-        fit, notes = self.registrar, self.state.notes
-        pulls = notes.setdefault("pull_pixels", [])
+        pulls = self.state.notes.setdefault("pull_pixels", [])
         same = [entry for entry in pulls if entry["side"] == turn.side]
         if len(same) >= 3 and same[-1]["validation"] > (1 - LEAST_FALL) * same[-3]["validation"]:
             return  # it has stopped falling
-        skin = Skin.attached(self.bind(1, 1))
-        rows = spread(self.scene.trained, REGISTRATION_FRAMES)
-        look = Appearance.plain(skin.count, fit.light)
-        seen = gather(self.scene, skin, fit.light, turn.side, rows, lambda f: progress(0.5 * f))
-        look.albedo = fill_unseen(seen, skin, 0.5)
-        pull = fit.step(turn, skin.binding, look)
+        pull = self._register(turn, Skin.attached(self.bind(*REGISTERED)), progress)
         trained = [row for row, view in enumerate(self.views) if not view.heldout]
         watched = [trained.index(row) for row in self.scene.validation] or list(range(len(trained)))
         pulls.append(
@@ -193,7 +193,22 @@ class Trainer:
             }
         )
 
+    def _register(self, turn: Round, skin: Skin, progress: Progressed) -> Tensor:
+        """One round against the texture as it is now; the pull of every training row [B]."""
+        fit = self.registrar
+        rows = spread(self.scene.trained, REGISTRATION_FRAMES)
+        look = Appearance.plain(skin.count, fit.light)
+        seen = gather(self.scene, skin, fit.light, turn.side, rows, lambda f: progress(0.5 * f))
+        look.albedo = fill_unseen(seen, skin, 0.5)
+        return fit.step(turn, skin.binding, look)
+
     def _convert(self, progress: Progressed) -> None:
+        final = self.bind(self.schedule.levels, self.schedule.depth)
+        if self.schedule.texture and (final.levels, final.depth) != REGISTERED:
+            # Other surfels stand otherwise over the mesh's outline: the surface settles under them.
+            skin = Skin.attached(final)
+            for turn in self.schedule.texture[-SETTLING:]:
+                self._register(turn, skin, lambda _: None)
         convert(
             self.state, self.scene, self.schedule, self.components, self.bind, self.registrar.light, progress
         )

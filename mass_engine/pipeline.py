@@ -202,7 +202,7 @@ def _fit_hand(
         per_frame=rows,
         seconds={name: round(value, 3) for name, value in meter.seconds.items()},
         peak_memory_bytes=peak_memory_bytes(),
-        fit=found_out,
+        fit={**found_out, "steps": result.state.steps},
         seed=options.seed,
         versions=versions(),
         machine=machine(),

@@ -30,6 +30,8 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         ["fit", "x.mp4", "--out", "o", "--holdout", "1"],
         ["fit", "x.mp4", "--out", "o", "--fov", "400"],
         ["fit", "x.mp4", "--out", "o", "--max-frames", "0"],
+        ["fit", "x.mp4", "--out", "o", "--levels", "3"],
+        ["fit", "x.mp4", "--out", "o", "--binding", "glue"],
         ["fit", "x.mp4", "--out", "o", "--template", "mano:none.pkl"],
         ["fit", "x.mp4", "--out", "o", "--device", "cuda"],
         ["render", "run", "--out", "x.png"],
@@ -81,3 +83,52 @@ def test_fit_reports_monotonic_progress_as_json_lines(demo_clip: Path, tmp_path:
 def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, mass_engine; print(sorted({'torch', 'cv2', 'numpy'} & set(sys.modules)))"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+def test_a_killed_fit_goes_on_with_resume(demo_clip: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command = ["fit", str(demo_clip), "--out", str(out), "--preset", "draft", "--max-frames", "8", "--json"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "mass_engine", *command], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if json.loads(line).get("message", "").startswith("conversion"):
+                process.kill()
+                break
+    assert (out / "checkpoint.safetensors").is_file()
+    assert not (out / "report.json").exists()
+    done = run(*command, "--resume")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((out / "report.json").read_text())
+    assert report["fit"]["resumed_after"] == "stage 1, outline"
+    assert not (out / "checkpoint.safetensors").exists(), "a finished run needs none"
+
+
+def test_switches_reach_the_fit(demo_clip: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    done = run(
+        *(
+            "fit",
+            str(demo_clip),
+            "--out",
+            str(out),
+            "--preset",
+            "draft",
+            "--max-frames",
+            "6",
+            "--levels",
+            "0",
+        ),
+        *("--no-refine-pose", "--no-shading", "--binding", "paper", "--exposure"),
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads((out / "report.json").read_text())
+    parts = report["options"]["components"]
+    assert parts["levels"] == 0
+    assert parts["binding"] == "paper"
+    assert parts["exposure"]
+    assert not parts["refine_pose"]
+    assert parts["densify"]
+    assert report["fit"]["capacity"]["levels"] == 0
+    assert not any(name.startswith("stage 1") for name in report["fit"]["steps"])

@@ -69,6 +69,7 @@ def test_binding_holds_the_surfels_near_the_mesh() -> None:
 
 def test_stage_two_leaves_the_geometry_alone() -> None:
     scene = thick_scene()
+    scene.validation = []  # every visit counts
     skin, look = started(scene)
     skin.deformation = skin.new_deformation(scene.shape.model, DeformationConfig(), 0)
     fitter = SurfelFit(scene)

@@ -3,9 +3,9 @@
 ``python benchmarks/shadow_trial.py VIDEO``
 
 Fits VIDEO with every 8th frame held out. Every surfel's occlusion by the other fingers' bones, taken as
-capsules, is rendered as a picture o; the strength s that makes render * (1 - s o) most like the video is found
-on the training frames by least squares. Prints s and what it gains on the held-out frames: more than 0.05 dB
-would earn the term its place.
+capsules, is rendered as a picture o; the strength s that makes render * (1 - s o) most like the video is
+found on the training frames by least squares. Prints s and what it gains on the held-out frames: more than
+0.05 dB would earn the term its place.
 """
 
 from __future__ import annotations

@@ -31,16 +31,17 @@ def _gaussian(size: int, sigma: float, like: Tensor) -> Tensor:
     return weights / weights.sum()
 
 
-def _blur(planes: Tensor, window: Tensor) -> Tensor:
-    """Separable filter without padding; ``planes`` [C,1,H,W]."""
-    row = functional.conv2d(planes, window.view(1, 1, 1, -1))
-    return functional.conv2d(row, window.view(1, 1, -1, 1))
+def _blur(planes: Tensor, window: Tensor, padding: int) -> Tensor:
+    """Separable filter over zeros around the picture; ``planes`` [C,1,H,W]."""
+    row = functional.conv2d(planes, window.view(1, 1, 1, -1), padding=(0, padding))
+    return functional.conv2d(row, window.view(1, 1, -1, 1), padding=(padding, 0))
 
 
-def ssim_maps(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """SSIM and its contrast-structure part, each [3,H-10,W-10]: 11x11 Gaussian window, sigma 1.5, valid."""
+def ssim_maps(image: Tensor, target: Tensor, padding: int = 0) -> tuple[Tensor, Tensor]:
+    """SSIM and its contrast-structure part, each [3,H-10,W-10] (without ``padding``): 11x11 Gaussian window,
+    sigma 1.5."""
     x, y = image.permute(2, 0, 1).unsqueeze(1), target.permute(2, 0, 1).unsqueeze(1)
-    moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), _gaussian(11, 1.5, image))[:, 0]
+    moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), _gaussian(11, 1.5, image), padding)[:, 0]
     mx, my, xx, yy, xy = moments.unflatten(0, (5, 3))
     structure = (2 * (xy - mx * my) + _C2) / (xx - mx * mx + yy - my * my + _C2)
     return structure * (2 * mx * my + _C1) / (mx * mx + my * my + _C1), structure
@@ -49,6 +50,11 @@ def ssim_maps(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 def ssim_valid(image: Tensor, target: Tensor) -> float:
     """Mean SSIM without padding (Wang et al. 2004; the convention of HandAvatar)."""
     return float(ssim_maps(image, target)[0].mean())
+
+
+def ssim_zero_padded(image: Tensor, target: Tensor) -> float:
+    """Mean SSIM with zeros around the picture (the convention of 3D Gaussian splatting)."""
+    return float(ssim_maps(image, target, 5)[0].mean())
 
 
 def ms_ssim(image: Tensor, target: Tensor) -> float:
@@ -67,11 +73,3 @@ def ms_ssim(image: Tensor, target: Tensor) -> float:
 
 def _halve(image: Tensor) -> Tensor:
     return functional.avg_pool2d(image.permute(2, 0, 1), 2).permute(1, 2, 0)
-
-
-def iou(mask: Tensor, target: Tensor, valid: Tensor | None = None) -> float:
-    """Intersection over union of two bool masks [H,W], over the ``valid`` pixels; 1 when both are empty."""
-    if valid is not None:
-        mask, target = mask & valid, target & valid
-    union = int((mask | target).sum())
-    return 1.0 if union == 0 else int((mask & target).sum()) / union

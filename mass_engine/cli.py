@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 
 from mass_engine.errors import BadArgumentError, EngineError
+from mass_engine.evaluation.arguments import add_eval_arguments
 from mass_engine.options import DEVICES, PRESETS, SEGMENTERS, SIDES, FitOptions
 from mass_engine.progress import Progress
 
@@ -100,6 +101,10 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("--pose", default="rest", metavar="SPEC")
     export.add_argument("--out", type=Path, required=True)
     export.set_defaults(run=_export)
+
+    evaluate = commands.add_parser("eval", help="score a run's held-out frames, or a whole data set")
+    add_eval_arguments(evaluate)
+    evaluate.set_defaults(run=_eval)
 
     bench = commands.add_parser("bench", help="measure speed on this machine")
     bench.add_argument("what", choices=("raster", "render"))
@@ -226,6 +231,12 @@ def _export(arguments: argparse.Namespace) -> None:
     avatar = Avatar.load(arguments.run_dir)
     write_ply(avatar.cloud(arguments.pose), arguments.out, "3dgs" if arguments.format == "ply3d" else "2dgs")
     print(f"wrote {arguments.out}")
+
+
+def _eval(arguments: argparse.Namespace) -> None:
+    from mass_engine.evaluation.command import evaluate
+
+    evaluate(arguments)
 
 
 def _bench(arguments: argparse.Namespace) -> None:

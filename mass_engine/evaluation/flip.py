@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 #: Monitor 0.7 m wide with 3840 pixels, seen from 0.7 m: the authors' default.
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
@@ -100,11 +101,11 @@ def _filtered(opponent: Tensor, ppd: float) -> Tensor:
 
 def _separable(plane: Tensor, row: Tensor, column: Tensor) -> Tensor:
     """``plane`` [H,W] by ``row`` along x and ``column`` along y; the border is repeated."""
-    radius = len(row) // 2
-    padded = functional.pad(plane[None, None], (radius,) * 4, mode="replicate")
-    padded = functional.conv2d(padded, row.view(1, 1, 1, -1))
-    result: Tensor = functional.conv2d(padded, column.view(1, 1, -1, 1))[0, 0]
-    return result
+    kernels = row.numpy(), column.numpy()
+    filtered = cv2.sepFilter2D(
+        np.ascontiguousarray(plane.numpy()), cv2.CV_64F, *kernels, borderType=cv2.BORDER_REPLICATE
+    )
+    return torch.from_numpy(filtered)
 
 
 def _lab(linear: Tensor) -> Tensor:

@@ -27,10 +27,10 @@ class Fragments:
 
     def interpolate(self, faces: NDArray[np.int64], values: Array) -> Array:
         """Values [V,C] of vertices at every pixel [H,W,C]; 0 where nothing is."""
-        corners = values[faces[np.maximum(self.face, 0)]]
-        result = (self.weights[..., None] * corners).sum(-2)
-        result[self.face < 0] = 0
-        return np.asarray(result)
+        hit = self.face >= 0
+        result = np.zeros((*hit.shape, values.shape[1]))
+        result[hit] = (self.weights[hit][..., None] * values[faces[self.face[hit]]]).sum(-2)
+        return result
 
 
 def rasterize_mesh(

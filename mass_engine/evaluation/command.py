@@ -12,6 +12,8 @@ from mass_engine.evaluation.datasets import arctic, hand_appearance, interhand
 from mass_engine.evaluation.datasets.outcome import EvalOptions
 from mass_engine.evaluation.heldout import FILE_NAME, evaluate_run
 from mass_engine.evaluation.lpips import LpipsSet
+from mass_engine.evaluation.synthetic import benchmark
+from mass_engine.evaluation.synthetic.benchmark import SyntheticOptions
 
 
 def tell(text: str) -> None:
@@ -24,6 +26,19 @@ def evaluate(arguments: argparse.Namespace) -> None:
     lpips = LpipsSet.load(arguments.lpips)
     if arguments.target in DATASETS:
         _dataset(arguments, lpips)
+    elif arguments.target == "synthetic":
+        out = arguments.out or Path("eval-synthetic")
+        options = SyntheticOptions(
+            out,
+            tuple(arguments.sequence),
+            arguments.preset,
+            arguments.seed,
+            arguments.quick,
+            lpips,
+            not arguments.no_refine,
+        )
+        print(benchmark.markdown(benchmark.run(options, tell), options))
+        print(f"wrote {out / 'results.md'}")
     else:
         run = Path(arguments.target)
         if arguments.video is None:

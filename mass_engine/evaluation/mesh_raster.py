@@ -79,15 +79,11 @@ def rasterize_mesh(
         over = found / z[triangle]  # screen weights to weights in space
         total = over.sum(1)
         d = 1 / total
-        order = np.lexsort((triangle, d, at))
-        at, d, triangle = at[order], d[order], triangle[order]
-        best = np.ones(len(at), bool)
-        best[1:] = at[1:] != at[:-1]
-        at, d, triangle = at[best], d[best], triangle[best]
-        nearer = d < depth[at]
-        rows = order[best][nearer]
-        depth[at[nearer]], face[at[nearer]] = d[nearer], triangle[nearer]
-        weights[at[nearer]] = over[rows] / total[rows, None]
+        np.minimum.at(depth, at, d)
+        nearest = d == depth[at]
+        at = at[nearest]
+        face[at] = triangle[nearest]
+        weights[at] = over[nearest] / total[nearest, None]
         first = last
     depth[face < 0] = 0
     return Fragments(

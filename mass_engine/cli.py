@@ -106,6 +106,11 @@ def build_parser() -> argparse.ArgumentParser:
     add_eval_arguments(evaluate)
     evaluate.set_defaults(run=_eval)
 
+    page = commands.add_parser("report", help="write one HTML page about a fit")
+    page.add_argument("run_dir", type=Path, metavar="RUN")
+    page.add_argument("--out", type=Path, metavar="FILE", help="instead of RUN/report.html")
+    page.set_defaults(run=_page)
+
     bench = commands.add_parser("bench", help="measure speed on this machine")
     bench.add_argument("what", choices=("raster", "render"))
     bench.add_argument("rest", nargs=argparse.REMAINDER)
@@ -237,6 +242,12 @@ def _eval(arguments: argparse.Namespace) -> None:
     from mass_engine.evaluation.command import evaluate
 
     evaluate(arguments)
+
+
+def _page(arguments: argparse.Namespace) -> None:
+    from mass_engine.evaluation.report_page import write_report
+
+    print(f"wrote {write_report(arguments.run_dir, arguments.out)}")
 
 
 def _bench(arguments: argparse.Namespace) -> None:

@@ -111,8 +111,10 @@ def build_parser() -> argparse.ArgumentParser:
     page.add_argument("--out", type=Path, metavar="FILE", help="instead of RUN/report.html")
     page.set_defaults(run=_page)
 
-    bench = commands.add_parser("bench", help="measure speed on this machine")
-    bench.add_argument("what", choices=("raster", "render"))
+    bench = commands.add_parser(
+        "bench", help="measure speed on this machine, speed against accuracy, or stability"
+    )
+    bench.add_argument("what", choices=("raster", "render", "pareto", "stability"))
     bench.add_argument("rest", nargs=argparse.REMAINDER)
     bench.set_defaults(run=_bench)
     return parser
@@ -255,6 +257,14 @@ def _bench(arguments: argparse.Namespace) -> None:
         from mass_engine.evaluation import bench_raster
 
         bench_raster.run(arguments.rest)
+    elif arguments.what == "pareto":
+        from mass_engine.evaluation import pareto
+
+        pareto.run(arguments.rest)
+    elif arguments.what == "stability":
+        from mass_engine.evaluation import stability
+
+        stability.run(arguments.rest)
     else:
         from mass_engine.evaluation import bench_render
 

@@ -114,7 +114,7 @@ def build_parser() -> argparse.ArgumentParser:
     bench = commands.add_parser(
         "bench", help="measure speed on this machine, speed against accuracy, or stability"
     )
-    bench.add_argument("what", choices=("raster", "render", "pareto", "stability"))
+    bench.add_argument("what", choices=("raster", "render", "pareto", "stability", "clips"))
     bench.add_argument("rest", nargs=argparse.REMAINDER)
     bench.set_defaults(run=_bench)
     return parser
@@ -265,6 +265,10 @@ def _bench(arguments: argparse.Namespace) -> None:
         from mass_engine.evaluation import stability
 
         stability.run(arguments.rest)
+    elif arguments.what == "clips":
+        from mass_engine.evaluation import by_clip
+
+        by_clip.run(arguments.rest)
     else:
         from mass_engine.evaluation import bench_render
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from mass_engine.cli import main
 from mass_engine.evaluation import pareto, stability
 from mass_engine.evaluation.charts import draw_bars
+from mass_engine.evaluation.heldout import REFINED
 from mass_engine.evaluation.pareto import Point, front, variants
 from mass_engine.evaluation.stability import Trial, summarised
 
@@ -94,3 +96,38 @@ def test_charts_say_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(EngineError) as caught:
         draw_bars("by clip", "dB", {"a": {"ours": 1.0}}, tmp_path / "x")
     assert caught.value.code == "charts.missing"
+
+
+def test_the_best_of_every_clip(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def made(name: str, clip: str, psnr: float, kind: str = "heldout", refined: float | None = None) -> Path:
+        run = tmp_path / name
+        run.mkdir()
+        report = {
+            "video": {"name": f"{clip}.mp4"},
+            "options": {},
+            "frames": {},
+            "metrics": {"psnr_hand_on_black": psnr},
+            "scored_frames": {"kind": kind},
+        }
+        (run / "report.json").write_text(json.dumps(report))
+        if refined is not None:
+            second = {REFINED: {"metrics": {"psnr_hand_on_black": refined}}}
+            (run / "evaluation.json").write_text(json.dumps({"metrics": report["metrics"], **second}))
+        return run
+
+    runs = [
+        made("1", "laptop", 28.0),
+        made("2", "laptop", 30.5, refined=33.0),
+        made("3", "waffle", 29.0),
+        made("4", "waffle", 99.0, "training"),  # not held out: no figure
+        made("5", "video", 27.0),
+    ]
+    out = tmp_path / "out"
+    assert main(["bench", "clips", *map(str, runs), "--out", str(out)]) == 0
+    assert "| laptop | 30.500 | 33.000 |" in capsys.readouterr().out
+    values = json.loads((out / "clips.json").read_text())["clips"]
+    assert values["waffle"] == {"held out": 29.0}
+    assert values["5"] == {"held out": 27.0}
+    assert (out / "clips.png").stat().st_size > 1000
+    assert main(["bench", "clips", str(runs[0]), "--metric", "nothing", "--out", str(out)]) == 2
+    assert main(["bench", "clips", str(runs[3]), "--out", str(out)]) == 2

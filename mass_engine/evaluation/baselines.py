@@ -108,10 +108,13 @@ def fit_baseline(name: BaselineName, hand: Registered, seed: int, effort: float 
 @dataclass
 class TexturedMesh:
     """``albedo`` [V',3] on the vertices of the refined mesh, under ``light`` [9,3]; the surface stands
-    ``swell`` metres over the registered one."""
+    ``swell`` metres over the registered one. Pictures of at most 256 pixels, in which such triangles would
+    be a fraction of a pixel, are drawn from ``rough``, the surface refined once, whose vertices are the first
+    of ``fine``'s: pose refinement draws thousands."""
 
     shape: Shape
     fine: Subdivision
+    rough: Subdivision
     albedo: Tensor
     light: Tensor
     camera: Camera
@@ -125,17 +128,21 @@ class TexturedMesh:
 
     def vertices(self, pose: HandPose) -> Tensor:
         """Refined vertices [V',3] of a pose (a batch of one)."""
+        return self._surface(pose, self.fine)
+
+    def _surface(self, pose: HandPose, subdivision: Subdivision) -> Tensor:
         with torch.no_grad():
-            mesh = self.fine.apply(self.shape.model.posed(pose, self.shape.displacement).vertices)[0]
-            return mesh + self.swell * vertex_normals(mesh, self.fine.faces)
+            mesh = subdivision.apply(self.shape.model.posed(pose, self.shape.displacement).vertices)[0]
+            return mesh + self.swell * vertex_normals(mesh, subdivision.faces)
 
     def render_pose(self, pose: HandPose, camera: Camera) -> RenderOutput:
         """Over black, anti-aliased by sub-pixels."""
-        mesh = self.vertices(pose)
-        faces = self.fine.faces.numpy()
-        shading = irradiance_basis(vertex_normals(mesh, self.fine.faces)) @ self.light
-        colors = (self.albedo * shading.clamp_min(0)).double().numpy()
-        k = self.finer
+        small = max(camera.width, camera.height) <= 256
+        surface, k = (self.rough, 1) if small else (self.fine, self.finer)
+        mesh = self._surface(pose, surface)
+        faces = surface.faces.numpy()
+        shading = irradiance_basis(vertex_normals(mesh, surface.faces)) @ self.light
+        colors = (self.albedo[: len(mesh)] * shading.clamp_min(0)).double().numpy()
         sharp = camera.resized(camera.width * k, camera.height * k)
         found = rasterize_mesh(mesh.double().numpy(), faces, sharp, cull=True)
         hit = (found.face >= 0)[..., None]
@@ -155,7 +162,8 @@ def fit_mesh(hand: Registered, levels: int = 3, side: int = 640, smooth: float =
     """
     model = hand.shape.model
     fine = loop_subdivision(model.faces, len(model.template), levels)
-    mesh = TexturedMesh(hand.shape, fine, torch.zeros(fine.n_vertices, 3), hand.light, hand.camera)
+    rough = loop_subdivision(model.faces, len(model.template), 1)
+    mesh = TexturedMesh(hand.shape, fine, rough, torch.zeros(fine.n_vertices, 3), hand.light, hand.camera)
     mesh.swell = _best_swell(mesh, hand)
     faces, count = fine.faces.numpy(), fine.n_vertices
     edges = mesh_edges(fine.faces).numpy()
@@ -204,7 +212,9 @@ def _best_swell(mesh: TexturedMesh, hand: Registered) -> float:
         for row in rows:
             level = hand.views[row].level(320)
             drawn = mesh_mask(
-                moved.vertices(hand.pose(row)).double().numpy(), mesh.fine.faces.numpy(), level.camera
+                moved._surface(hand.pose(row), mesh.rough).double().numpy(),
+                mesh.rough.faces.numpy(),
+                level.camera,
             )
             overlaps.append(iou(torch.from_numpy(drawn), level.hand > 0.5, level.valid > 0.5))
         found.append(float(np.mean(overlaps)))

@@ -39,11 +39,10 @@ def draw(chart: Chart, path: Path) -> list[Path]:
     figure = _canvas()
     axes = figure.subplots()
     for one in chart.series:
-        style = "-" if one.line else ""
         axes.plot(
             one.x,
             one.y,
-            style,
+            linestyle="-" if one.line else "none",
             marker=one.marker,
             label=one.name,
             markersize=11 if one.emphasis else 5,

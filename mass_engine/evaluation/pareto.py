@@ -27,6 +27,7 @@ from mass_engine.evaluation.baselines import (
     register,
 )
 from mass_engine.evaluation.charts import Chart, Series, draw
+from mass_engine.evaluation.command import tell
 from mass_engine.evaluation.heldout import REFINED, number, score_frames
 from mass_engine.evaluation.refine import RefineOptions
 from mass_engine.evaluation.scores import Renderable, mean_scores
@@ -281,9 +282,7 @@ def run(rest: Sequence[str]) -> None:
     command = " ".join(["mass-engine bench pareto", *rest])
     for name, clip in clips_of(arguments.videos, arguments.quick, arguments.seed, arguments.max_frames, out):
         names.append(name)
-        for point in measure(
-            clip, name, arguments.quick, arguments.seed, not arguments.no_refine, lambda text: print(text)
-        ):
+        for point in measure(clip, name, arguments.quick, arguments.seed, not arguments.no_refine, tell):
             points.append(point)
             data = {
                 "command": command,

@@ -29,8 +29,9 @@ _SHELL, _RANDOM_SCALE = 0.006, 0.002
 _DILATION = 0.3
 #: Learning rates: metres, quaternions, logarithms, logits, colour.
 _RATES = {"offsets": 1e-4, "quats": 0.01, "log_scales": 0.01, "opacity_logits": 0.03, "albedo": 0.02}
-#: (longer side in pixels, visits of every frame).
-_PASSES = ((160, 4.0), (320, 4.0), (640, 3.0))
+#: (longer side in pixels, visits of every frame), and the least steps of each: few frames are no excuse.
+_PASSES = ((160, 5.0), (320, 5.0), (640, 3.0))
+_LEAST_STEPS = 120
 
 
 @dataclass
@@ -189,7 +190,11 @@ def train_splats(
         betas=(0.9, 0.98),
         eps=1e-15,
     )
-    plan = [side for side, visits in _PASSES for _ in range(max(1, round(effort * visits * len(trained))))]
+    plan = [
+        side
+        for side, visits in _PASSES
+        for _ in range(max(1, round(effort * max(visits * len(trained), _LEAST_STEPS))))
+    ]
     queue: list[int] = []
     for step, side in enumerate(plan):
         if not queue:

@@ -20,6 +20,7 @@ import numpy as np
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.evaluation.baselines import BASELINES, BaselineName, fit_baseline, register
 from mass_engine.evaluation.charts import Chart, Series, draw
+from mass_engine.evaluation.command import tell
 from mass_engine.evaluation.heldout import REFINED
 from mass_engine.evaluation.pareto import clips_of, fit_clip
 from mass_engine.evaluation.perturb import Level, axes
@@ -255,7 +256,7 @@ def run(rest: Sequence[str]) -> None:
     for name, clip in clips_of(arguments.videos, arguments.quick, 0, arguments.max_frames, out):
         for trial in trials(
             clip, name, wanted, methods, seeds, schedule_for(arguments.preset), arguments.refine,
-            0.3 if arguments.quick else 1.0, print,
+            0.3 if arguments.quick else 1.0, tell,
         ):  # fmt: skip
             found.append(trial)
             data = {"command": command, "quick": arguments.quick, "trials": [asdict(t) for t in found]}

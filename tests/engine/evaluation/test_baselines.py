@@ -37,7 +37,7 @@ def hand() -> Registered:
 def test_a_baseline_learns_the_look_and_shows_it_in_a_frame_it_has_not_seen(
     hand: Registered, name: BaselineName
 ) -> None:
-    made = fit_baseline(name, hand, 0, effort=1.5)
+    made = fit_baseline(name, hand, 0, effort=0.3)
     found = score_view(made, hand.views[2], hand.pose(2))
     assert found["psnr_in_mask"] > 18, found
     assert found["silhouette_iou"] > 0.9, found

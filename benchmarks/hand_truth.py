@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from mass_engine.evaluation.surfaces import surface_distance
 from mass_engine.fitting.subject import vertex_normals
 from mass_engine.hand.builtin import joint_frames, joint_limits, load_builtin
 from mass_engine.hand.model import HandModel
@@ -187,29 +188,6 @@ def wrist_place(model: HandModel, pose: HandPose, vertices: Tensor) -> Tensor:
         to_world = model.posed(pose).bone_transforms[:, 0]
     local = (vertices - to_world[:, None, :3, 3]) @ to_world[:, :3, :3]
     return local[..., 0] if model.side == "right" else -local[..., 0]
-
-
-def surface_distance(points: Array, vertices: Array, faces: NDArray[np.int64], near: int = 16) -> Array:
-    """Distance [P] of points to the nearest of the ``near`` triangles with the closest centroids."""
-    corners = vertices[faces]
-    candidates = cKDTree(corners.mean(1)).query(points, k=near)[1]
-    return np.asarray(_point_triangle(points[:, None], corners[candidates]).min(1))
-
-
-def _point_triangle(p: Array, corners: Array) -> Array:
-    """Distances of points [...,3] to triangles [...,3,3]: inside by the plane, else the nearest edge."""
-    a, b, c = np.moveaxis(corners, -2, 0)
-    n = np.cross(b - a, c - a)
-    area = np.maximum((n * n).sum(-1), 1e-30)
-    inside = np.ones(p.shape[:1] + corners.shape[1:2], bool)
-    nearest = np.full(inside.shape, np.inf)
-    for u, v in ((a, b), (b, c), (c, a)):
-        edge = v - u
-        inside &= (np.cross(edge, p - u) * n).sum(-1) >= 0
-        place = np.clip(((p - u) * edge).sum(-1) / np.maximum((edge * edge).sum(-1), 1e-30), 0, 1)
-        nearest = np.minimum(nearest, np.linalg.norm(p - u - place[..., None] * edge, axis=-1))
-    plane = np.abs(((p - a) * n).sum(-1)) / np.sqrt(area)
-    return np.where(inside, plane, nearest)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

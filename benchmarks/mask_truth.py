@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mass_engine.evaluation.outlines import border, free_border, signed_distance
 from mass_engine.preprocess import MASK_SAMPLES
 from mass_engine.tracking.models import HandNetworks
 from mass_engine.tracking.segmentation import HAND, IGNORE, HandMask, HandSegmenter
@@ -28,21 +29,6 @@ from mass_engine.video.reader import read_frames
 _BAND = 4.0
 _NAMES = ("IoU", "F 1 px", "F 2 px", "lost", "worn", "offset", "error")
 
-Bools = NDArray[np.bool_]
-
-
-def signed_distance(inside: Bools) -> NDArray[np.float32]:
-    """Pixels to the nearest pixel of the other kind, positive inside."""
-    flat = inside.astype(np.uint8)
-    within, without = (cv2.distanceTransform(side, cv2.DIST_L2, 5) for side in (flat, 1 - flat))
-    return np.asarray(within - without, np.float32)
-
-
-def border(inside: Bools) -> Bools:
-    """Pixels inside that touch the outside."""
-    core = np.asarray(cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)))
-    return np.asarray(inside & (core == 0))
-
 
 def score(mask: HandMask, truth: NDArray[np.uint8]) -> list[float]:
     """The numbers of ``_NAMES`` for one frame."""
@@ -50,8 +36,7 @@ def score(mask: HandMask, truth: NDArray[np.uint8]) -> list[float]:
     worn, hand = truth == 160, truth == 80
     judged = (labels != IGNORE) & ~worn & (truth != 240)
     mine, true = (labels == HAND) & judged, hand & judged
-    near = cv2.dilate((~judged).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    near[:3] = near[-3:] = near[:, :3] = near[:, -3:] = True
+    near = ~free_border(judged)
     to_mine, to_true = signed_distance(labels == HAND), signed_distance(hand)
     my_border, true_border = border(labels == HAND) & ~near, border(hand) & ~near
     fits = []

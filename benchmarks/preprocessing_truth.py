@@ -21,11 +21,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from hand_truth import load_truth, rest_kept, surface_distance, wrist_place
+from hand_truth import load_truth, rest_kept, wrist_place
 from numpy.typing import NDArray
 
 from mass_engine.avatar import row_pose
 from mass_engine.camera import Camera
+from mass_engine.evaluation.surfaces import similarity, surface_distance
 from mass_engine.fitting.geometry import GeometryFit
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.schedule import schedule_for
@@ -80,16 +81,6 @@ class TruthClip:
         mask = cv2.imread(str(self.masks / f"{index:06d}.png"), cv2.IMREAD_GRAYSCALE)
         assert mask is not None
         return np.asarray(mask, np.uint8)
-
-
-def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation and shift that lay points [N,3] on points (Umeyama 1991)."""
-    a, b = source - source.mean(0), target - target.mean(0)
-    u, d, vt = np.linalg.svd(b.T @ a)
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ flip @ vt
-    scale = float((d * np.diag(flip)).sum() / (a * a).sum())
-    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 
 from mass_engine.errors import BadArgumentError, EngineError
+from mass_engine.evaluation.arguments import add_eval_arguments
 from mass_engine.fitting.components import BINDINGS, Components
 from mass_engine.options import DEVICES, PRESETS, SEGMENTERS, SIDES, FitOptions
 from mass_engine.progress import Progress
@@ -114,8 +115,19 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("--out", type=Path, required=True)
     export.set_defaults(run=_export)
 
-    bench = commands.add_parser("bench", help="measure speed on this machine")
-    bench.add_argument("what", choices=("raster", "render", "fit"))
+    evaluate = commands.add_parser("eval", help="score a run's held-out frames, or a whole data set")
+    add_eval_arguments(evaluate)
+    evaluate.set_defaults(run=_eval)
+
+    page = commands.add_parser("report", help="write one HTML page about a fit")
+    page.add_argument("run_dir", type=Path, metavar="RUN")
+    page.add_argument("--out", type=Path, metavar="FILE", help="instead of RUN/report.html")
+    page.set_defaults(run=_page)
+
+    bench = commands.add_parser(
+        "bench", help="measure speed on this machine, speed against accuracy, or stability"
+    )
+    bench.add_argument("what", choices=("raster", "render", "fit", "pareto", "stability", "clips"))
     bench.add_argument("rest", nargs=argparse.REMAINDER)
     bench.set_defaults(run=_bench)
     return parser
@@ -257,6 +269,18 @@ def _export(arguments: argparse.Namespace) -> None:
     print(f"wrote {arguments.out}")
 
 
+def _eval(arguments: argparse.Namespace) -> None:
+    from mass_engine.evaluation.command import evaluate
+
+    evaluate(arguments)
+
+
+def _page(arguments: argparse.Namespace) -> None:
+    from mass_engine.evaluation.report_page import write_report
+
+    print(f"wrote {write_report(arguments.run_dir, arguments.out)}")
+
+
 def _bench(arguments: argparse.Namespace) -> None:
     if arguments.what == "raster":
         from mass_engine.evaluation import bench_raster
@@ -266,6 +290,18 @@ def _bench(arguments: argparse.Namespace) -> None:
         from mass_engine.evaluation import bench_fit
 
         bench_fit.run(arguments.rest)
+    elif arguments.what == "pareto":
+        from mass_engine.evaluation import pareto
+
+        pareto.run(arguments.rest)
+    elif arguments.what == "stability":
+        from mass_engine.evaluation import stability
+
+        stability.run(arguments.rest)
+    elif arguments.what == "clips":
+        from mass_engine.evaluation import by_clip
+
+        by_clip.run(arguments.rest)
     else:
         from mass_engine.evaluation import bench_render
 

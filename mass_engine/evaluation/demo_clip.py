@@ -22,6 +22,7 @@ from torch import Tensor
 from mass_engine.camera import Camera
 from mass_engine.fitting.subject import Appearance, Shape, pose_surfels, render_row
 from mass_engine.hand.builtin import load_builtin
+from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
 from mass_engine.hand.poses import named_pose
 from mass_engine.raster import RasterOptions
@@ -61,13 +62,13 @@ def demo_frames(options: ClipOptions | None = None) -> Iterator[NDArray[np.uint8
         light,
     )
     camera = Camera.from_fov(o.width, o.height, 55.0)
-    background = _background(o.width, o.height, random)
+    table = background(o.width, o.height, random)
     count = max(2, round(o.seconds * o.fps))
     for number in range(count):
-        pose = _motion(number / count, shape)
+        pose = motion(number / count, model, shape.betas)
         out = render_row(look, pose_surfels(shape, binding, pose), 0, binding.bones, camera, RasterOptions())
         alpha = out.alpha.unsqueeze(-1).numpy()
-        picture = out.rgb.numpy() + (1 - alpha) * background
+        picture = out.rgb.numpy() + (1 - alpha) * table
         noisy = picture + random.normal(0, 0.006, picture.shape)
         yield (np.clip(noisy, 0, 1) * 255).round().astype(np.uint8)
 
@@ -76,8 +77,9 @@ def _batch(pose: HandPose, betas: Tensor) -> HandPose:
     return HandPose(betas[None], pose.global_orient[None], pose.hand_pose[None], pose.transl[None], pose.side)
 
 
-def _motion(phase: float, shape: Shape) -> HandPose:
-    """The back and sides of an upright hand, opening, counting and closing in a loop; phase 0..1."""
+def motion(phase: float, model: HandModel, betas: Tensor) -> HandPose:
+    """A pose (a batch of one) of a right hand with ``betas`` [10], at ``phase`` 0..1 of a loop: an upright
+    hand that sways, opens, counts and closes."""
     stops = ("spread", "rest", "point", "fist", "pinch", "spread")
     place = phase * (len(stops) - 1)
     first, mix = int(place), place - int(place)
@@ -90,14 +92,14 @@ def _motion(phase: float, shape: Shape) -> HandPose:
     sway = _rotation([0, 1, 0], 0.5 * math.sin(turn)) @ _rotation([1, 0, 0], 0.35 * math.sin(2 * turn + 1))
     orient, _ = cv2.Rodrigues((sway @ facing @ upright).astype(np.float64))
     placed = HandPose(
-        shape.betas[None],
+        betas[None],
         torch.tensor(orient.ravel(), dtype=torch.float32)[None],
         (a * (1 - mix) + b * mix)[None],
         torch.zeros(1, 3),
         "right",
     )
     with torch.no_grad():
-        joints = shape.model.joints(placed)[0]
+        joints = model.joints(placed)[0]
     drift = torch.tensor([0.03 * math.sin(turn), 0.02 * math.cos(turn), 0.42 + 0.04 * math.sin(turn + 2)])
     return HandPose(
         placed.betas, placed.global_orient, placed.hand_pose, (drift - joints.mean(0))[None], "right"
@@ -127,8 +129,8 @@ def _skin(means: Tensor, normals: Tensor, random: np.random.Generator) -> Tensor
     return torch.tensor(np.clip(albedo, 0.02, 1), dtype=torch.float32)
 
 
-def _background(width: int, height: int, random: np.random.Generator) -> NDArray[np.float32]:
-    """A table top with boxes and papers of many colours."""
+def background(width: int, height: int, random: np.random.Generator) -> NDArray[np.float32]:
+    """A table top [H,W,3] in 0..1 with boxes and papers of many colours."""
     small = random.normal(0, 1, (height // 16, width // 16)).astype(np.float32)
     cloud = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
     picture = np.array([0.46, 0.50, 0.52], np.float32) + 0.035 * cloud[..., None]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 
+import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -25,23 +28,26 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
-def _gaussian(size: int, sigma: float, like: Tensor) -> Tensor:
-    offset = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
-    weights = torch.exp(-0.5 * (offset / sigma) ** 2)
-    return weights / weights.sum()
+def _blur(picture: NDArray[np.floating]) -> NDArray[np.floating]:
+    """11x11 Gaussian, sigma 1.5, over zeros around the picture [H,W,C]."""
+    offset = np.arange(11) - 5
+    row = np.exp(-0.5 * (offset / 1.5) ** 2)
+    row /= row.sum()
+    planes = [
+        cv2.sepFilter2D(np.ascontiguousarray(picture[..., c]), -1, row, row, borderType=cv2.BORDER_CONSTANT)
+        for c in range(picture.shape[-1])
+    ]
+    return np.stack(planes, -1)
 
 
-def _blur(planes: Tensor, window: Tensor) -> Tensor:
-    """Separable filter without padding; ``planes`` [C,1,H,W]."""
-    row = functional.conv2d(planes, window.view(1, 1, 1, -1))
-    return functional.conv2d(row, window.view(1, 1, -1, 1))
-
-
-def ssim_maps(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """SSIM and its contrast-structure part, each [3,H-10,W-10]: 11x11 Gaussian window, sigma 1.5, valid."""
-    x, y = image.permute(2, 0, 1).unsqueeze(1), target.permute(2, 0, 1).unsqueeze(1)
-    moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), _gaussian(11, 1.5, image))[:, 0]
-    mx, my, xx, yy, xy = moments.unflatten(0, (5, 3))
+def ssim_maps(image: Tensor, target: Tensor, padding: int = 0) -> tuple[Tensor, Tensor]:
+    """SSIM and its contrast-structure part, each [H-10,W-10,3] (without ``padding``): 11x11 Gaussian window,
+    sigma 1.5."""
+    x, y = image.numpy(), target.numpy()
+    moments = (_blur(part) for part in (x, y, x * x, y * y, x * y))
+    edge = 5 - padding
+    inner = slice(edge, x.shape[0] - edge), slice(edge, x.shape[1] - edge)
+    mx, my, xx, yy, xy = (torch.from_numpy(np.ascontiguousarray(part[inner])) for part in moments)
     structure = (2 * (xy - mx * my) + _C2) / (xx - mx * mx + yy - my * my + _C2)
     return structure * (2 * mx * my + _C1) / (mx * mx + my * my + _C1), structure
 
@@ -49,6 +55,11 @@ def ssim_maps(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 def ssim_valid(image: Tensor, target: Tensor) -> float:
     """Mean SSIM without padding (Wang et al. 2004; the convention of HandAvatar)."""
     return float(ssim_maps(image, target)[0].mean())
+
+
+def ssim_zero_padded(image: Tensor, target: Tensor) -> float:
+    """Mean SSIM with zeros around the picture (the convention of 3D Gaussian splatting)."""
+    return float(ssim_maps(image, target, 5)[0].mean())
 
 
 def ms_ssim(image: Tensor, target: Tensor) -> float:
@@ -59,7 +70,7 @@ def ms_ssim(image: Tensor, target: Tensor) -> float:
     for scale, weight in enumerate(MS_SSIM_WEIGHTS):
         full, structure = ssim_maps(image, target)
         last = scale == len(MS_SSIM_WEIGHTS) - 1
-        result = result * (full if last else structure).mean((1, 2)).clamp_min(0) ** weight
+        result = result * (full if last else structure).mean((0, 1)).clamp_min(0) ** weight
         if not last:
             image, target = (_halve(picture) for picture in (image, target))
     return float(result.mean())
@@ -67,11 +78,3 @@ def ms_ssim(image: Tensor, target: Tensor) -> float:
 
 def _halve(image: Tensor) -> Tensor:
     return functional.avg_pool2d(image.permute(2, 0, 1), 2).permute(1, 2, 0)
-
-
-def iou(mask: Tensor, target: Tensor, valid: Tensor | None = None) -> float:
-    """Intersection over union of two bool masks [H,W], over the ``valid`` pixels; 1 when both are empty."""
-    if valid is not None:
-        mask, target = mask & valid, target & valid
-    union = int((mask | target).sum())
-    return 1.0 if union == 0 else int((mask & target).sum()) / union

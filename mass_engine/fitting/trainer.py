@@ -117,7 +117,7 @@ class Trainer:
             steps.append(
                 (name, _visit_cost(part), lambda p, part=part, n=number: self._appearance(part, n, p))  # type: ignore[misc]
             )
-        if self.scene.validation:
+        if self.scene.validation and s.appearance:
             steps.append(("stage 2, all frames", 0.3 * _visit_cost(s.appearance[-1]), self._fold_back))
         if any(view.heldout for view in self.views):
             steps.append(("held-out poses", sum(_cost(turn) for turn in s.heldout) / 7, self._heldout))

@@ -1,0 +1,133 @@
+"""The drivers' tables, fronts and charts, without their long runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mass_engine.cli import main
+from mass_engine.evaluation import pareto, stability
+from mass_engine.evaluation.charts import draw_bars
+from mass_engine.evaluation.heldout import REFINED
+from mass_engine.evaluation.pareto import Point, front, variants
+from mass_engine.evaluation.stability import Trial, summarised
+
+
+def test_the_front_is_what_nothing_beats() -> None:
+    points = [(1.0, 20.0), (2.0, 25.0), (3.0, 24.0), (4.0, 30.0), (2.0, 22.0)]
+    assert front(points, most=False) == [0, 1, 3]
+    assert front(points, most=True) == [3]
+    assert front([], most=True) == []
+
+
+def test_the_grid_changes_one_thing_at_a_time() -> None:
+    grid = variants(quick=False)
+    assert set(grid["preset"]) == {"draft", "auto", "full"}
+    base = grid["preset"]["auto"]
+    assert {count.harmonics for count in grid["harmonics"].values()} == {0, 3, 8, 15}
+    for schedule in grid["harmonics"].values():
+        assert (schedule.levels, schedule.appearance) == (base.levels, base.appearance)
+    assert max(step.side for step in grid["resolution"]["160 px"].appearance) == 160
+    assert len(variants(quick=True)["preset"]) == 1
+
+
+def point(name: str, group: str, seconds: float, psnr: float, clip: str = "a", error: str = "") -> Point:
+    metrics: dict[str, float | None] = {"psnr_in_mask": psnr, "ms_ssim_hand_on_black": 0.9}
+    return Point(clip, group, name, seconds, 50.0, 1000, 10, metrics, {}, error)
+
+
+def test_pareto_tables_and_charts(tmp_path: Path) -> None:
+    points = [
+        point("auto", "preset", 10.0, 28.0),
+        point("auto", "preset", 20.0, 26.0, "b"),
+        point("mesh", "baseline", 5.0, 25.0),
+        point("mesh", "baseline", 0.0, 0.0, "b", "RuntimeError: no"),
+    ]
+    table = pareto.markdown(points, ["a", "b"], "the command")
+    assert "| preset | auto | 15.0 | 50 | 1 | 10 | 27.000 |" in table
+    assert "| baseline | mesh |" not in table  # not on every clip
+    assert "failed: b, mesh: RuntimeError: no" in table
+    written = pareto.charts(points, tmp_path)
+    assert {path.suffix for path in written} == {".svg", ".png"}
+    assert all(path.stat().st_size > 1000 for path in written)
+    first = written[0].read_bytes()
+    pareto.charts(points, tmp_path)
+    assert written[0].read_bytes() == first  # equal figures are equal files
+
+
+def test_stability_counts_failures(tmp_path: Path) -> None:
+    found = [
+        Trial("a", "blur, px", 0.0, "as it is", "ours", 0, 28.0, 0.9),
+        Trial("a", "blur, px", 0.0, "as it is", "ours", 1, 27.0, 0.9),
+        Trial("a", "blur, px", 2.0, "2", "ours", 0, 26.0, 0.9, 29.0),
+        Trial("a", "blur, px", 2.0, "2", "ours", 1, 23.0, 0.9, 27.0),
+        Trial("a", "blur, px", 4.0, "4", "ours", 0, None, None, None, "RuntimeError: no"),
+    ]
+    rows = {row["level"]: row for row in summarised(found)}
+    assert rows["as it is"]["failure_rate"] == 0
+    assert rows["2"]["psnr_in_mask"] == 24.5
+    assert rows["2"]["worst"] == 23.0
+    assert rows["2"]["failure_rate"] == 0.5
+    assert rows["2"]["psnr_in_mask_after_test_time_pose_refinement"] == 28.0
+    assert rows["4"]["psnr_in_mask"] is None
+    assert rows["4"]["failure_rate"] == 1.0
+    table = stability.markdown(found, "the command")
+    assert "| 2 | 24.50 / 23.00, 50% fail |" in table
+    assert "| 4 | failed |" in table
+    assert len(stability.charts(found, tmp_path)) == 2
+
+
+def test_bars_and_wrong_axes(tmp_path: Path) -> None:
+    written = draw_bars(
+        "by clip", "dB", {"a": {"ours": 28.0, "mesh": 25.0}, "b": {"ours": 27.0}}, tmp_path / "x"
+    )
+    assert [path.name for path in written] == ["x.svg", "x.png"]
+    assert main(["bench", "stability", "--axis", "nothing"]) == 2
+
+
+def test_charts_say_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    from mass_engine.errors import EngineError
+
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(EngineError) as caught:
+        draw_bars("by clip", "dB", {"a": {"ours": 1.0}}, tmp_path / "x")
+    assert caught.value.code == "charts.missing"
+
+
+def test_the_best_of_every_clip(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def made(name: str, clip: str, psnr: float, kind: str = "heldout", refined: float | None = None) -> Path:
+        run = tmp_path / name
+        run.mkdir()
+        report = {
+            "video": {"name": f"{clip}.mp4"},
+            "options": {},
+            "frames": {},
+            "metrics": {"psnr_hand_on_black": psnr},
+            "scored_frames": {"kind": kind},
+        }
+        (run / "report.json").write_text(json.dumps(report))
+        if refined is not None:
+            second = {REFINED: {"metrics": {"psnr_hand_on_black": refined}}}
+            (run / "evaluation.json").write_text(json.dumps({"metrics": report["metrics"], **second}))
+        return run
+
+    runs = [
+        made("1", "laptop", 28.0),
+        made("2", "laptop", 30.5, refined=33.0),
+        made("3", "waffle", 29.0),
+        made("4", "waffle", 99.0, "training"),  # not held out: no figure
+        made("5", "video", 27.0),
+    ]
+    out = tmp_path / "out"
+    assert main(["bench", "clips", *map(str, runs), "--out", str(out)]) == 0
+    assert "| laptop | 30.500 | 33.000 |" in capsys.readouterr().out
+    values = json.loads((out / "clips.json").read_text())["clips"]
+    assert values["waffle"] == {"held out": 29.0}
+    assert values["5"] == {"held out": 27.0}
+    assert (out / "clips.png").stat().st_size > 1000
+    assert main(["bench", "clips", str(runs[0]), "--metric", "nothing", "--out", str(out)]) == 2
+    assert main(["bench", "clips", str(runs[3]), "--out", str(out)]) == 2

@@ -21,6 +21,7 @@ from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.schedule import SWEEP, Schedule
 from mass_engine.fitting.skin import Skin
 from mass_engine.fitting.state import FitState, fingerprint_of
+from mass_engine.fitting.steadying import jitter, steadied
 from mass_engine.fitting.subject import Appearance, Shape
 from mass_engine.fitting.surfel_fit import SurfelFit, SurfelPass, SurfelWeights
 from mass_engine.fitting.views import View
@@ -268,10 +269,15 @@ def fit_hand(
     steps of the same fit, it goes on after them, with the same result as if it had never stopped.
     """
     torch.manual_seed(seed)
+    components = components or Components()
+    noise = float(jitter(start).max())
+    if components.refine_pose:
+        start = steadied(start)
     state = FitState(
         PoseTable(start), Shape.mean(model, start.betas[0]), white_light(), torch.ones(len(views), 3)
     )
-    trainer = Trainer(views, state, camera, schedule, components or Components(), seed, start)
+    trainer = Trainer(views, state, camera, schedule, components, seed, start)
+    state.notes["start_jitter_radians"] = round(noise, 4)
     with one_thread():  # thousands of small operators; the rasteriser has threads of its own
         trainer.run(progress, checkpoint)
     evidence = state.evidence

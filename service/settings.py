@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 GIB = 1024**3
+
+_QUEUES: tuple[Literal["cpu", "gpu"], ...] = ("cpu", "gpu")
 
 
 class Settings(BaseSettings):
@@ -21,7 +24,9 @@ class Settings(BaseSettings):
     database_url: str = ""
     #: Broker; None means the embedded one (see ``broker_url`` in service/queue.py).
     redis_url: str | None = None
-    queue_name: str = "mass"
+    #: Where a job goes that does not say which device it needs, and what a worker here takes.
+    default_queue: Literal["cpu", "gpu"] = "cpu"
+    worker_queues: list[Literal["cpu", "gpu"]] = Field(default_factory=lambda: [*_QUEUES], min_length=1)
 
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)

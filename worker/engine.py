@@ -28,6 +28,7 @@ FLAGS: dict[str, str] = {
     "fov": "--fov",
     "max_frames": "--max-frames",
     "holdout": "--holdout",
+    "device": "--device",
 }
 
 #: All that the engine sees of our environment; passwords and URLs of the service are not in it.
@@ -68,15 +69,24 @@ class UnknownOptionError(ValueError):
 
 
 def fit_command(
-    engine: Sequence[str], video: Path, run: Path, options: Mapping[str, str | int | float | None]
+    engine: Sequence[str],
+    video: Path,
+    run: Path,
+    options: Mapping[str, str | int | float | None],
+    *,
+    resume: bool = False,
 ) -> list[str]:
-    """The command that fits ``video`` into the directory ``run``. Raises UnknownOptionError."""
+    """The command that fits ``video`` into the directory ``run``, or goes on with what lies there already.
+
+    Raises UnknownOptionError.
+    """
     unknown = sorted(set(options) - set(FLAGS))
     if unknown:
         raise UnknownOptionError(f"unknown option {unknown[0]!r}")
     # One word per option, so that no value can be taken for a flag.
     flags = [f"{FLAGS[name]}={value}" for name, value in options.items() if value is not None]
-    return [*engine, "fit", str(video), "--out", str(run), "--json", *flags]
+    again = ["--resume"] if resume else []
+    return [*engine, "fit", str(video), "--out", str(run), "--json", *again, *flags]
 
 
 def engine_environment(source: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -9,7 +9,7 @@ import uuid
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import JSON, Enum, Index, String, Text
+from sqlalchemy import JSON, BigInteger, Enum, Index, String, Text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 
@@ -87,9 +87,11 @@ class Job(Base):
     message: Mapped[str] = mapped_column(Text, default="")
 
     options: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
+    #: Which workers may take it: ``cpu`` or ``gpu``.
+    queue: Mapped[str] = mapped_column(String(20), default="cpu", server_default="cpu")
     #: The uploaded video, relative to the data directory; no name chosen by a client appears in it.
     video: Mapped[str] = mapped_column(String(200))
-    video_bytes: Mapped[int | None] = mapped_column(default=None)
+    video_bytes: Mapped[int | None] = mapped_column(BigInteger, default=None)
 
     error_code: Mapped[str | None] = mapped_column(String(80), default=None)
     error_message: Mapped[str | None] = mapped_column(Text, default=None)

@@ -30,6 +30,9 @@ class JobOptions(BaseModel):
     max_frames: int | None = Field(
         default=None, ge=2, le=100_000, description="Use at most this many frames."
     )
+    device: Literal["auto", "cpu", "cuda"] | None = Field(
+        default=None, description="Where to compute; the job waits for a worker that has it."
+    )
     holdout: int | None = Field(
         default=None,
         ge=2,

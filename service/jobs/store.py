@@ -34,6 +34,7 @@ class Claim:
     attempt: int
     options: dict[str, Any]
     video: str
+    queue: str = "cpu"
 
     @property
     def artifact(self) -> str:
@@ -93,6 +94,7 @@ class JobStore:
         *,
         job_id: str | None = None,
         video_bytes: int | None = None,
+        queue: str = "cpu",
     ) -> Job:
         """Insert a queued job. ``video`` is the upload's path relative to the data directory."""
         now = self._clock()
@@ -100,6 +102,7 @@ class JobStore:
             id=job_id or new_job_id(now),
             state=JobState.QUEUED,
             options=dict(options),
+            queue=queue,
             video=video,
             video_bytes=video_bytes,
             created_at=now,
@@ -187,10 +190,12 @@ class JobStore:
                 time_left=None,
                 message="",
             )
-        ).returning(Job.attempt, Job.options, Job.video)
+        ).returning(Job.attempt, Job.options, Job.video, Job.queue)
         with self._session.begin() as session:
             row = session.execute(statement).one_or_none()
-        return None if row is None else Claim(job_id, token, row.attempt, row.options, row.video)
+        if row is None:
+            return None
+        return Claim(job_id, token, row.attempt, row.options, row.video, row.queue)
 
     def heartbeat(self, job_id: str, token: str, lease_seconds: float = 60.0) -> Heartbeat:
         """Renew the lease and learn whether to go on."""
@@ -276,8 +281,11 @@ class JobStore:
         with self._session() as session:
             return [*session.scalars(query)]
 
-    def mark_published(self, job_id: str) -> bool:
-        """The message went out; it is due again after a wait that doubles each time, up to the maximum."""
+    def mark_published(self, job_id: str, *, if_due: bool = False) -> bool:
+        """The message went out; it is due again after a wait that doubles each time, up to the maximum.
+
+        ``if_due``: only if it is due now, so that of several reconcilers one sends it.
+        """
         job = self.get(job_id)
         if job is None:
             return False
@@ -287,10 +295,16 @@ class JobStore:
         return self._update(
             Job.id == job_id,
             Job.publish_attempts == job.publish_attempts,
+            *((Job.publish_due_at <= now,) if if_due else ()),
             last_published_at=now,
             publish_attempts=job.publish_attempts + 1,
             publish_due_at=now + wait,
         )
+
+    def mark_unpublished(self, job_id: str) -> bool:
+        """The message marked last did not go out after all: it is due at once."""
+        back = {"publish_attempts": Job.publish_attempts - 1, "publish_due_at": self._clock()}
+        return self._update(Job.id == job_id, Job.publish_attempts > 0, **back)
 
     def requeue_expired_leases(self, max_attempts: int | None = None) -> list[str]:
         """Take back jobs whose worker went silent; returns those queued again.

@@ -14,6 +14,7 @@ from service.jobs.model import Job, is_job_id, new_job_id
 from service.jobs.schemas import JobOptions, JobPage, JobView, job_view
 from service.jobs.store import Cancel
 from service.problems import Kind, ProblemError, declared
+from service.queue import queue_for
 from service.services import Services, ServicesDep, not_modified
 from service.uploads import ReceivedForm, receive_form, refuse_early
 
@@ -87,7 +88,7 @@ async def create_job(request: Request, response: Response, services: ServicesDep
         # Not awaited in a thread: a cancelled request may await nothing more.
         services.storage.discard_upload(job_id)
         raise
-    await run_in_threadpool(_announce, services, job_id)
+    await run_in_threadpool(_announce, services, job)
     response.headers["Location"] = f"/jobs/{job_id}"
     return job_view(job)
 
@@ -95,12 +96,13 @@ async def create_job(request: Request, response: Response, services: ServicesDep
 def _accept(services: Services, job_id: str, form: ReceivedForm) -> Job:
     video = services.storage.finish_upload(job_id)
     options = form.options.model_dump(exclude_none=True)
-    return services.store.create(options, video, job_id=job_id, video_bytes=form.video_bytes)
+    queue = queue_for(options, services.settings)
+    return services.store.create(options, video, job_id=job_id, video_bytes=form.video_bytes, queue=queue)
 
 
-def _announce(services: Services, job_id: str) -> None:
-    if services.queue.publish(job_id):
-        services.store.mark_published(job_id)
+def _announce(services: Services, job: Job) -> None:
+    if services.queue.publish(job.id, job.queue):
+        services.store.mark_published(job.id)
 
 
 @router.get("", responses=declared(Kind.REQUEST_INVALID))

@@ -139,10 +139,10 @@ class Bench:
             environment[f"MASS_{name.upper()}"] = text
         return {**environment, "CANARY_SECRET": "c4n4ry"}
 
-    def worker(self) -> Worker:
+    def worker(self, **environment: str) -> Worker:
         """Start one more worker process; not waited for."""
         log = self.root / f"worker-{len(self.workers)}.log"
-        self.workers.append(Worker(self.settings, self.environment(), log))
+        self.workers.append(Worker(self.settings, {**self.environment(), **environment}, log))
         return self.workers[-1]
 
     def kill_broker(self) -> None:
@@ -156,23 +156,30 @@ class Bench:
 
     # Jobs
 
-    def job(self, mode: str = "succeed", gated: bool = False, options: dict[str, Any] | None = None) -> str:
+    def job(
+        self,
+        mode: str = "succeed",
+        gated: bool = False,
+        options: dict[str, Any] | None = None,
+        queue: str = "cpu",
+        **more: Any,
+    ) -> str:
         """A queued row with its video, not published. ``gated``: the engine waits for :meth:`open_gate`."""
         job_id = new_job_id()
-        plan = {"mode": mode, "log": str(self.root / f"{job_id}.log")}
+        plan = {"mode": mode, "log": str(self.root / f"{job_id}.log"), **more}
         if gated:
             plan["gate"] = str(self.root / f"{job_id}.gate")
         self.storage.begin_upload(job_id).write_bytes(b"PLAN:" + json.dumps(plan).encode())
         video = self.storage.finish_upload(job_id)
-        self.store.create(options or {}, video, job_id=job_id)
+        self.store.create(options or {}, video, job_id=job_id, queue=queue)
         return job_id
 
     def publish(self, job_id: str) -> bool:
         """What the API does after creating the row."""
-        return self.queue.publish(job_id) and self.store.mark_published(job_id)
+        return self.queue.publish(job_id, self.row(job_id).queue) and self.store.mark_published(job_id)
 
-    def submit(self, mode: str = "succeed", gated: bool = False) -> str:
-        job_id = self.job(mode, gated)
+    def submit(self, mode: str = "succeed", gated: bool = False, **more: Any) -> str:
+        job_id = self.job(mode, gated, **more)
         assert self.publish(job_id)
         return job_id
 
@@ -212,6 +219,11 @@ class Bench:
     def until(self, job_id: str, state: str) -> Job:
         """Wait for a state."""
         return self.when(job_id, f"is {state}", lambda job: job.state == state)
+
+    def words(self, job_id: str) -> list[str]:
+        """All that its engines wrote, in order."""
+        log = self.root / f"{job_id}.log"
+        return [line.split()[0] for line in log.read_text().splitlines()] if log.exists() else []
 
     def engine(self, job_id: str, number: int = 1) -> int:
         """Wait for the ``number``-th start of the job's engine; returns its pid."""

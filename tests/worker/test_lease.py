@@ -53,7 +53,7 @@ class Queue(JobQueue):
         self.tried = 0
         self.away = False
 
-    def publish(self, job_id: str) -> bool:
+    def publish(self, job_id: str, queue: str | None = None) -> bool:
         self.tried += 1
         if not self.away:
             self.sent.append(job_id)
@@ -165,6 +165,17 @@ def test_a_broker_that_is_away_is_tried_once_a_round_and_nothing_is_marked_sent(
     world.queue.away = False
     world.reconciler.tick()
     assert sorted(world.queue.sent) == sorted(jobs)
+
+
+def test_of_two_reconcilers_with_the_same_list_one_sends(world: World) -> None:
+    job_id = world.job()
+    world.clock.now += 3.0
+    other = Reconciler(world.settings, world.store, world.storage, world.queue)
+    overdue = world.real.due_for_publish()
+    world.reconciler.tick()
+    world.flaky.due_for_publish = lambda: overdue  # type: ignore[attr-defined]  # read before the other sent
+    other.tick()
+    assert world.queue.sent == [job_id]
 
 
 def test_a_silent_worker_loses_its_job(world: World) -> None:

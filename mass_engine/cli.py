@@ -67,6 +67,13 @@ def build_parser() -> argparse.ArgumentParser:
     fit.add_argument("--device", choices=DEVICES, default="auto")
     fit.add_argument("--fov", type=float, metavar="DEGREES", help="field of view of the longer image side")
     fit.add_argument("--max-frames", type=int, default=FitOptions.max_frames, metavar="N")
+    fit.add_argument(
+        "--max-seconds",
+        type=float,
+        default=FitOptions.max_seconds,
+        metavar="S",
+        help="refuse a longer video",
+    )
     fit.add_argument("--json", action="store_true", help="progress as JSON lines on standard output")
     fit.set_defaults(run=_fit)
 
@@ -164,6 +171,7 @@ def _fit(arguments: argparse.Namespace) -> None:
         device=arguments.device,
         fov=arguments.fov,
         max_frames=arguments.max_frames,
+        max_seconds=arguments.max_seconds,
     )
     # Heavy imports only once the arguments are good.
     from mass_engine.pipeline import fit_hands_to_directory, fit_to_directory

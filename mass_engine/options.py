@@ -30,7 +30,7 @@ class FitOptions:
     ``holdout`` N keeps the frames N-1, 2N-1, ... out of the fit (0: none). ``fov`` in degrees spans the
     longer image side; None takes what the file says or a phone-like default; the report says which.
     ``max_frames`` bounds the frames the fit sees; held-out frames do not count, of which at most 160 (or
-    ``max_frames``, if that is more) are kept, evenly spread.
+    ``max_frames``, if that is more) are kept, evenly spread. A video of more than ``max_seconds`` is refused.
     """
 
     template: str = "builtin"
@@ -45,6 +45,7 @@ class FitOptions:
     device: str = "auto"
     fov: float | None = None
     max_frames: int = 160
+    max_seconds: float = 600.0
 
     def __post_init__(self) -> None:
         checks = (
@@ -66,6 +67,12 @@ class FitOptions:
             (self.holdout == 0 or self.holdout >= 2, "holdout", self.holdout, "Use 0, or 2 and more."),
             (self.fov is None or 5 <= self.fov <= 150, "fov", self.fov, "Use 5 to 150 degrees."),
             (2 <= self.max_frames <= 10_000, "max_frames", self.max_frames, "Use 2 to 10000."),
+            (
+                0 < self.max_seconds < 1e6,
+                "max_seconds",
+                self.max_seconds,
+                "Use a positive number of seconds.",
+            ),
             (0 <= self.seed < 2**63, "seed", self.seed, "Use a number from 0 on."),
         )
         for good, name, value, advice in checks:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from service.client import DEFAULT_URL, AssetInfo, JobInfo, MassClient, ServiceError
+from service.processes import hide_memory
 from service.progress import FollowBar, transfer_bar
 
 _FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
@@ -51,6 +52,7 @@ def _serve(options: argparse.Namespace) -> int:
     from service.embedded import BrokerError
     from service.serve import ServeError, serve
 
+    hide_memory()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s serve %(levelname)s %(message)s")
     logging.getLogger("httpx").setLevel(logging.WARNING)
     settings = _settings(options)
@@ -67,6 +69,7 @@ def _api(options: argparse.Namespace) -> int:
 
     from service.app import create_app
 
+    hide_memory()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s api[%(process)d] %(levelname)s %(message)s")
     settings = _settings(options)
     if settings is None:

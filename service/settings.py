@@ -61,6 +61,17 @@ class Settings(BaseSettings):
     #: The engine's command line; tests put another program here.
     engine_command: list[str] | None = None
 
+    #: "require": a worker that cannot shut the engine in as it should does not start; "best" says so and
+    #: goes on.
+    sandbox: Literal["best", "require"] = "best"
+    #: The user that the engine becomes where the worker is root.
+    engine_user: str = "nobody"
+    #: Its address space (0: no limit; a GPU's driver needs that), and the largest file it may write.
+    engine_memory_bytes: int = Field(default=24 * GIB, ge=0)
+    engine_file_bytes: int = Field(default=4 * GIB, gt=0)
+    #: Further folders it may read and write, for instance one with weights of its own.
+    engine_paths: list[Path] = Field(default_factory=list)
+
     @field_validator("data_dir")
     @classmethod
     def _absolute(cls, value: Path) -> Path:

@@ -61,7 +61,8 @@ class Storage:
         self._uploads = data_dir / "uploads"
         self._jobs = data_dir / "jobs"
         for folder in (self._uploads, self._jobs):
-            folder.mkdir(parents=True, exist_ok=True, mode=0o750)
+            # Others may pass through but not look around: an engine under another user has to get in.
+            folder.mkdir(parents=True, exist_ok=True, mode=0o751)
 
     def free_bytes(self) -> int:
         """Bytes an unprivileged process may still write."""

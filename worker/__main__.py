@@ -8,8 +8,10 @@ import warnings
 
 from celery.platforms import SecurityWarning
 
+from service.processes import hide_memory
 from service.settings import Settings
 from worker.app import run_worker
+from worker.sandbox import announce, self_test
 
 
 def main() -> int:
@@ -24,7 +26,14 @@ def main() -> int:
         logging.getLogger(name).setLevel(logging.WARNING)
     # The warning is about messages that carry code, which root must not run; only JSON is accepted here.
     warnings.simplefilter("ignore", SecurityWarning)
-    return run_worker(Settings())
+    hide_memory()
+    settings = Settings()
+    report = self_test(settings)
+    announce(report)
+    if settings.sandbox == "require" and not report.is_sound:
+        logging.error("the engine cannot be shut in here as MASS_SANDBOX=require asks; not starting")
+        return 1
+    return run_worker(settings)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The engine as a child process: its command line, its environment, its events, its end."""
+"""The engine as a child process: its command line, its events, its end."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import math
-import os
 import signal
 import subprocess
 import threading
@@ -31,16 +30,6 @@ FLAGS: dict[str, str] = {
     "device": "--device",
 }
 
-#: All that the engine sees of our environment; passwords and URLs of the service are not in it.
-_ENVIRONMENT = frozenset(
-    {
-        *("PATH", "HOME", "LANG", "LC_ALL", "LC_CTYPE", "TZ", "TMPDIR", "XDG_CACHE_HOME", "MASS_MODEL_DIR"),
-        *("OMP_NUM_THREADS", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "SYSTEMROOT"),
-        *("CUDA_VISIBLE_DEVICES", "NVIDIA_VISIBLE_DEVICES", "NVIDIA_DRIVER_CAPABILITIES"),
-    }
-)
-
-_LIMITS = {"core": 0, "nofile": 4096, "fsize": 16 * 1024**3}
 _MAX_LINE = 64 * 1024
 _TAIL_LINES = 40
 
@@ -75,42 +64,38 @@ def fit_command(
     options: Mapping[str, str | int | float | None],
     *,
     resume: bool = False,
+    max_seconds: float | None = None,
 ) -> list[str]:
     """The command that fits ``video`` into the directory ``run``, or goes on with what lies there already.
 
-    Raises UnknownOptionError.
+    A video longer than ``max_seconds`` is to be refused. Raises UnknownOptionError.
     """
     unknown = sorted(set(options) - set(FLAGS))
     if unknown:
         raise UnknownOptionError(f"unknown option {unknown[0]!r}")
     # One word per option, so that no value can be taken for a flag.
     flags = [f"{FLAGS[name]}={value}" for name, value in options.items() if value is not None]
-    again = ["--resume"] if resume else []
-    return [*engine, "fit", str(video), "--out", str(run), "--json", *again, *flags]
-
-
-def engine_environment(source: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment of the engine: the harmless part of ours, and what makes its output prompt."""
-    ours = os.environ if source is None else source
-    kept = {name: value for name, value in ours.items() if name in _ENVIRONMENT}
-    return {**kept, "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
+    if max_seconds is not None:
+        flags.append(f"--max-seconds={max_seconds:g}")
+    if resume:
+        flags.append("--resume")
+    return [*engine, "fit", str(video), "--out", str(run), "--json", *flags]
 
 
 class EngineProcess:
     """One run. Start it from the thread that stays until it ends; always call :meth:`stop` at the end."""
 
-    def __init__(self, command: Sequence[str]) -> None:
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
         self.progress: EngineProgress | None = None
         self.failure: EngineFailure | None = None
         self._tail: deque[str] = deque(maxlen=_TAIL_LINES)
         self._closed = threading.Event()
         self._process = launch(
             command,
-            env=engine_environment(),
+            env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             death_signal=signal.SIGKILL,
-            limits=_LIMITS,
         )
         assert self._process.stdout is not None
         assert self._process.stderr is not None

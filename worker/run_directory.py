@@ -14,6 +14,7 @@ from pathlib import Path
 
 from service.jobs.store import Claim
 from service.storage import Storage
+from worker.sandbox import SCRATCH
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +67,7 @@ def _copy(source: Path, target: Path) -> None:
     """Copy plain files and folders; an engine's output is not trusted, so links are left out."""
     for path in source.iterdir():
         mode = path.lstat().st_mode
-        if stat.S_ISDIR(mode):
+        if stat.S_ISDIR(mode) and path.name != SCRATCH:
             (target / path.name).mkdir(mode=0o750)
             _copy(path, target / path.name)
         elif stat.S_ISREG(mode) and path.name not in _RESULTS:

@@ -24,6 +24,7 @@ from service.settings import Settings
 from service.storage import Storage
 from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, fit_command
 from worker.run_directory import drop_checkpoint, has_checkpoint, prepare
+from worker.sandbox import Sandbox
 
 log = logging.getLogger(__name__)
 
@@ -117,6 +118,7 @@ class Supervisor:
         self._settings, self._store, self._storage, self._queue = settings, store, storage, queue
         self._stopping = stopping
         self._clock = clock
+        self._sandbox = Sandbox(settings)
 
     def run(self, job_id: str) -> Outcome:
         """Do the job if it can be claimed. Raises only when the database cannot be reached."""
@@ -172,16 +174,25 @@ class Supervisor:
         run, resumed = prepare(self._storage, claim)
         video = self._storage.source(claim.video)
         try:
-            command = fit_command(self._settings.engine, video, run, claim.options, resume=resumed)
+            command = fit_command(
+                self._settings.engine,
+                video,
+                run,
+                claim.options,
+                resume=resumed,
+                max_seconds=self._settings.max_video_seconds,
+            )
         except UnknownOptionError as error:
             return self._fail(claim, "options.invalid", f"The job has an {error}.", "Submit it without.")
-        engine = EngineProcess(command)
+        self._sandbox.open(run, video)
+        engine = EngineProcess(self._sandbox.command(command, run, video), self._sandbox.environment(run))
         grace = 0.0
         try:
             stop = self._watch(claim, lease, engine)
             grace = {_Stop.CANCEL: _CANCEL_GRACE, _Stop.SHUTDOWN: _SHUTDOWN_GRACE}.get(stop, 0.0)
         finally:
             code = engine.stop(grace)
+            self._sandbox.close(run)
         match stop:
             case _Stop.LOST:
                 return Outcome.LOST

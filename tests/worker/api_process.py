@@ -61,7 +61,7 @@ class Api:
         return note.read_text().count("start ") if note.exists() else 0
 
     def _note(self, name: str) -> Path:
-        return self._bench.root / f"{name}.log"
+        return self._bench.notebook / f"{name}.log"
 
     def kill(self) -> None:
         self.process.kill()

@@ -58,7 +58,16 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--json", action="store_true", required=True)
     parser.add_argument("--resume", action="store_true")
-    for flag in ("--preset", "--side", "--seed", "--fov", "--max-frames", "--holdout", "--device"):
+    for flag in (
+        "--preset",
+        "--side",
+        "--seed",
+        "--fov",
+        "--max-frames",
+        "--holdout",
+        "--device",
+        "--max-seconds",
+    ):
         parser.add_argument(flag)
     options = parser.parse_args()
     plan: dict[str, Any] = json.loads(options.video.read_bytes().rpartition(b"PLAN:")[2])

@@ -48,9 +48,11 @@ def test_the_engine_gets_the_options_and_none_of_the_services_secrets(running: B
     assert job.artifact is not None
     seen = json.loads((running.storage.artifact_path(job_id, job.artifact) / "tracks.json").read_text())
     flags = [word for word in seen["argv"] if word.startswith("--") and word != "--out"]
-    assert sorted(flags) == ["--json", "--max-frames=30", "--preset=draft", "--seed=7"]
+    assert sorted(flags) == [
+        *("--json", "--max-frames=30", "--max-seconds=600", "--preset=draft", "--seed=7")
+    ]
     assert "CANARY_SECRET" in running.environment()
-    assert [name for name in seen["env"] if name.startswith(("MASS_", "CANARY"))] == []
+    assert [name for name in seen["env"] if name.startswith(("MASS_", "CANARY"))] == ["MASS_MODEL_DIR"]
 
 
 def test_a_video_the_engine_cannot_use_fails_with_its_code(running: Bench) -> None:
@@ -103,7 +105,7 @@ def test_output_that_is_no_event_does_no_harm(running: Bench) -> None:
 def test_a_process_left_behind_by_the_engine_is_ended_with_it(running: Bench) -> None:
     job_id = running.submit("child")
     running.until(job_id, "succeeded")
-    words = (running.root / f"{job_id}.log").read_text().split()
+    words = (running.notebook / f"{job_id}.log").read_text().split()
     child = next(int(word.split(":")[1]) for word in words if word.startswith("child:"))
     wait_for("the child is gone", lambda: not alive(child))
 

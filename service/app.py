@@ -20,7 +20,7 @@ from service.guard import Guard
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
 from service.problems import Kind, ProblemBody, declared
 from service.rendering import Loader, load_avatar
-from service.routes import assets, jobs, renders, system
+from service.routes import assets, jobs, renders, submission, system
 from service.services import open_services
 from service.settings import Settings
 
@@ -51,7 +51,7 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
     )
     problems.install(app)
     everywhere = declared(Kind.REQUEST_HOST, Kind.REQUEST_ORIGIN, Kind.INTERNAL)
-    for router in (jobs.router, renders.router, assets.router, system.router):
+    for router in (submission.router, jobs.router, renders.router, assets.router, system.router):
         app.include_router(router, responses=everywhere)
     app.add_api_route("/", _page, include_in_schema=False)
     app.mount("/web", StaticFiles(directory=_WEB), name="web")

@@ -15,7 +15,7 @@ from urllib.parse import quote
 import httpx
 
 DEFAULT_URL = "http://127.0.0.1:8000"
-FINAL = frozenset({"succeeded", "failed", "cancelled"})
+FINAL = frozenset({"succeeded", "failed", "cancelled", "expired"})
 
 #: Told how many bytes of how many have been sent or received.
 BytesProgress = Callable[[int, int], None]

@@ -126,7 +126,31 @@ class Kind(Enum):
         "job.finished",
         409,
         "The job is over already",
-        "Nothing to cancel; use DELETE to remove it.",
+        "There is nothing to cancel; DELETE removes it.",
+    )
+    JOB_UNFINISHED = (
+        "job.unfinished",
+        409,
+        "The job is not over yet",
+        "Cancel it first, or wait for its end.",
+    )
+    JOB_NO_VIDEO = (
+        "job.no_video",
+        409,
+        "The job's video is no longer here",
+        "Submit the video again.",
+    )
+    IDEMPOTENCY_IN_PROGRESS = (
+        "idempotency.in_progress",
+        409,
+        "The same request is being answered now",
+        "Wait for its answer, or send it again after the seconds in Retry-After.",
+    )
+    IDEMPOTENCY_MISMATCH = (
+        "idempotency.mismatch",
+        422,
+        "This Idempotency-Key came with another request before",
+        "Use a new key for each new request.",
     )
     ASSET_NOT_FOUND = (
         "asset.not_found",
@@ -158,6 +182,12 @@ class Kind(Enum):
         422,
         "The picture would be too large",
         "Ask for fewer pixels; /capabilities names the limit.",
+    )
+    RENDER_NO_HAND = (
+        "render.no_hand",
+        404,
+        "The job has no such hand",
+        "Leave `hand` out, or submit the video with the option `side` set to `both`.",
     )
     RENDER_REFUSED = ("render.refused", 422, "The engine refused the request", "Change the pose or camera.")
     RENDER_FAILED = (

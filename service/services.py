@@ -9,7 +9,8 @@ from typing import Annotated, cast
 
 from fastapi import Depends, Request
 
-from service.jobs.model import Job, JobState, is_job_id
+from service.jobs.idempotency import IdempotencyKeys
+from service.jobs.model import FINAL_STATES, Job, JobState, is_job_id
 from service.jobs.store import JobStore, create_store
 from service.pictures import PictureCache
 from service.problems import Kind, ProblemError
@@ -25,6 +26,7 @@ class Services:
 
     settings: Settings
     store: JobStore
+    keys: IdempotencyKeys
     storage: Storage
     queue: JobQueue
     pool: RenderPool
@@ -42,7 +44,7 @@ class Services:
         job = self.job(job_id)
         if job.state == JobState.SUCCEEDED and job.artifact is not None:
             return job.artifact
-        if job.state in (JobState.FAILED, JobState.CANCELLED):
+        if job.state in FINAL_STATES:
             raise ProblemError(Kind.JOB_NO_RESULT, f"The job is {job.state}.")
         raise ProblemError(Kind.JOB_NOT_READY, f"The job is {job.state}.", headers={"Retry-After": "5"})
 
@@ -59,7 +61,8 @@ def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
         pool = create_pool(settings, loader)
         stack.callback(pool.close)
         pool.start()
-        yield Services(settings, store, storage, queue, pool, PictureCache(settings.render_cache_bytes))
+        pictures = PictureCache(settings.render_cache_bytes)
+        yield Services(settings, store, IdempotencyKeys(store.engine), storage, queue, pool, pictures)
 
 
 async def _services(request: Request) -> Services:

@@ -29,7 +29,11 @@ ASSET_TYPES: dict[str, str] = {
     "tracks.json": "application/json",
     "surfels.ply": "application/octet-stream",
 }
+#: A job for both hands has the files of each in a folder of its own.
+_HAND = re.compile(r"(?:left|right)/")
 _PREVIEW = re.compile(r"previews/[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(png|jpg|webp)")
+#: Without these an attempt has not finished.
+OUTPUTS = ("avatar.safetensors", "report.json", "surfels.ply")
 _PREVIEW_TYPES = {"png": "image/png", "jpg": "image/jpeg", "webp": "image/webp"}
 _ARTIFACT = re.compile(r"[0-9]{1,6}-[0-9a-zA-Z]{1,64}")
 _MANIFEST = "assets.json"
@@ -47,6 +51,7 @@ class Asset:
 
 def media_type(name: str) -> str | None:
     """The media type of an asset that may be served; None for every other name."""
+    name = _HAND.sub("", name, count=1) if _HAND.match(name) else name
     if _PREVIEW.fullmatch(name):
         return _PREVIEW_TYPES[name.rsplit(".", 1)[1]]
     return ASSET_TYPES.get(name)
@@ -93,6 +98,23 @@ class Storage:
         """Forget an upload, complete or not."""
         shutil.rmtree(self._uploads / _checked(job_id), ignore_errors=True)
 
+    def share_upload(self, reference: str, job_id: str) -> str:
+        """Give a second job the video of a first one; returns the new reference.
+
+        Each has a name of its own for the same bytes: removing one leaves the other. Raises
+        FileNotFoundError when the video has been removed.
+        """
+        source = self.source(reference)
+        part = self.begin_upload(job_id)
+        try:
+            os.link(source, part)
+        except FileNotFoundError:
+            self.discard_upload(job_id)
+            raise
+        except OSError:  # a file system without links
+            shutil.copyfile(source, part)
+        return self.finish_upload(job_id)
+
     def source(self, reference: str) -> Path:
         """The video a row refers to (``Job.video``)."""
         path = self.root / reference
@@ -135,7 +157,8 @@ class Storage:
                 _fsync(path)
         manifest = folder / _MANIFEST
         manifest.write_text(json.dumps([asdict(asset) for asset in assets]))
-        for path in (manifest, *(p for p in (folder / "previews",) if p.is_dir()), folder, folder.parent):
+        folders = sorted((p for p in folder.rglob("*") if p.is_dir() and not p.is_symlink()), reverse=True)
+        for path in (manifest, *folders, folder, folder.parent):
             _fsync(path)
         _fsync(self._jobs)
         return assets
@@ -150,8 +173,10 @@ class Storage:
         if media_type(name) is None:
             return None
         found = next((asset for asset in self.assets(job_id, artifact) if asset.name == name), None)
-        path = self._artifact(job_id, artifact) / name
-        if found is None or path.parent.is_symlink() or not stat.S_ISREG(path.lstat().st_mode):
+        folder = self._artifact(job_id, artifact)
+        path = folder / name
+        linked = any(parent.is_symlink() for parent in path.parents if parent.is_relative_to(folder))
+        if found is None or linked or not stat.S_ISREG(path.lstat().st_mode):
             return None
         return found, path
 
@@ -172,6 +197,13 @@ class Storage:
         if _ARTIFACT.fullmatch(artifact) is None:
             raise ValueError(f"not an artifact: {artifact!r}")
         return self._jobs / _checked(job_id) / artifact
+
+
+def missing_outputs(folder: Path) -> list[str]:
+    """What a finished attempt in ``folder`` lacks: its files, or those of each hand it made."""
+    hands = [name for name in ("left", "right") if (folder / name).is_dir()]
+    needed = [f"{hand}/{name}" for hand in hands for name in OUTPUTS] or list(OUTPUTS)
+    return [name for name in (*needed, "report.json") if not (folder / name).is_file()]
 
 
 def create_storage(settings: Settings) -> Storage:

@@ -7,6 +7,7 @@ writes the video straight to where it stays, looks at its first bytes, and stops
 from __future__ import annotations
 
 import errno
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -41,6 +42,7 @@ class ReceivedForm:
 
     options: JobOptions
     video_bytes: int
+    video_sha256: str
 
 
 def container(head: bytes) -> str | None:
@@ -114,6 +116,7 @@ class _Form:
         self._limit = max_video_bytes
         self._file = target.open("wb")
         self._head = b""
+        self._digest = hashlib.sha256()
         self._video_bytes: int | None = None
         self._options: bytearray | None = None
         self._received = 0
@@ -168,7 +171,7 @@ class _Form:
             raise ProblemError(Kind.UPLOAD_INCOMPLETE, "The form ends before its closing boundary.")
         if self._video_bytes is None:
             raise ProblemError(Kind.VIDEO_MISSING)
-        return ReceivedForm(self._parsed_options(), self._video_bytes)
+        return ReceivedForm(self._parsed_options(), self._video_bytes, self._digest.hexdigest())
 
     def close(self) -> None:
         """Close the file."""
@@ -224,7 +227,9 @@ class _Form:
             self._head += data[start : min(end, start + _SNIFF)]
             if len(self._head) >= _SNIFF:
                 self._check_container()
-        self._file.write(memoryview(data)[start:end])
+        part = memoryview(data)[start:end]
+        self._digest.update(part)
+        self._file.write(part)
 
     def _part_end(self) -> None:
         if self._field == "video":

@@ -20,7 +20,7 @@ from service.jobs.housekeeping import purge_deleted
 from service.jobs.store import Claim, Heartbeat, JobStore
 from service.queue import JobQueue
 from service.settings import Settings
-from service.storage import Storage
+from service.storage import Storage, missing_outputs
 from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, fit_command
 
 log = logging.getLogger(__name__)
@@ -31,9 +31,6 @@ _CANCEL_SECONDS = 1.0
 #: How long a cancelled engine, and one stopped by a shutdown, may take to end by itself.
 _CANCEL_GRACE = 2.0
 _SHUTDOWN_GRACE = 5.0
-
-#: Without these an exit code of 0 is not believed.
-OUTPUTS = ("avatar.safetensors", "report.json", "surfels.ply")
 
 _EXIT_BAD_ARGUMENTS = 2
 _EXIT_BAD_INPUT = 3
@@ -211,7 +208,7 @@ class Supervisor:
     def _conclude(self, claim: Claim, lease: Lease, engine: EngineProcess, code: int, run: Path) -> Outcome:
         said = engine.failure
         if code == 0:
-            missing = [name for name in OUTPUTS if not (run / name).is_file()]
+            missing = missing_outputs(run)
             if not missing:
                 return self._succeed(claim, lease)
             log.error("job %s: the engine left no %s", claim.job_id, ", ".join(missing))

@@ -71,8 +71,8 @@ async function watch(id) {
   if (current !== id) return;
   complain(job.error);
   const label = job.state === "running" && job.stage ? job.stage : job.state;
-  progress(job.cancel_requested ? "stopping" : label, job.fraction, job.time_left, job.message);
-  show("cancel", Boolean(job.links.cancel) && !job.cancel_requested);
+  progress(label, job.fraction, job.time_left, job.message);
+  show("cancel", Boolean(job.links.cancel) && job.state !== "cancelling");
   show("delete", !job.links.cancel);
   show("result", Boolean(job.links.render));
   if (job.links.cancel) timer = setTimeout(() => watch(id), 1000);

@@ -119,7 +119,7 @@ def test_cancel_ends_a_running_engine(running: Bench, mode: str) -> None:
     job = running.until(job_id, "cancelled")
     assert job.artifact is None
     assert running.notes(job_id, "end") == []
-    assert running.store.request_cancel(job_id) is Cancel.FINISHED
+    assert running.store.request_cancel(job_id) is Cancel.CANCELLED
 
 
 def test_deleting_a_running_job_ends_its_engine_and_leaves_no_file(running: Bench) -> None:

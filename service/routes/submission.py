@@ -1,0 +1,152 @@
+"""How jobs come in: a video with its options, or another job's video with other options."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Request, Response
+from fastapi.concurrency import run_in_threadpool
+
+from service.jobs.model import FINAL_STATES
+from service.jobs.schemas import JobOptions, JobView, RestartRequest, job_view
+from service.problems import Kind, ProblemError, declared
+from service.routes.jobs import JobId
+from service.services import Services, ServicesDep
+from service.submission import Wanted, changed_options, fingerprint, spelled, submit
+from service.uploads import receive_form, refuse_early
+
+router = APIRouter(prefix="/jobs", tags=["jobs"])
+
+_FORM: dict[str, Any] = {
+    "required": True,
+    "content": {
+        "multipart/form-data": {
+            "schema": {
+                "type": "object",
+                "required": ["video"],
+                "additionalProperties": False,
+                "properties": {
+                    "video": {
+                        "type": "string",
+                        "contentMediaType": "application/octet-stream",
+                        "description": "An MP4, MOV or WebM file.",
+                    },
+                    "options": {
+                        "type": "string",
+                        "contentMediaType": "application/json",
+                        "contentSchema": JobOptions.model_json_schema(),
+                        "description": "JSON; every option may be left out.",
+                    },
+                },
+            },
+            "encoding": {"options": {"contentType": "application/json"}},
+        }
+    },
+}
+
+_ACCEPTED: dict[int | str, dict[str, Any]] = {
+    202: {
+        "description": "Accepted; `Location` is where to look for progress.",
+        "headers": {
+            "Location": {"schema": {"type": "string"}},
+            "Idempotency-Replayed": {
+                "schema": {"type": "string", "enum": ["true"]},
+                "description": "The job was made by an earlier request with the same key.",
+            },
+        },
+    }
+}
+_IDEMPOTENCY = (Kind.IDEMPOTENCY_IN_PROGRESS, Kind.IDEMPOTENCY_MISMATCH, Kind.JOB_NOT_FOUND)
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        description="Makes it safe to send the request again: with the same key and body it makes no second "
+        "job. 1 to 128 visible ASCII characters, remembered for 24 hours.",
+        examples=["5f0c7e1a-8d1c-4b7e-9d55-0e6f0b7f2f11"],
+    ),
+]
+
+
+@router.post(
+    "",
+    status_code=202,
+    response_model=JobView,
+    openapi_extra={"requestBody": _FORM},
+    responses={
+        **_ACCEPTED,
+        **declared(
+            Kind.REQUEST_MALFORMED,
+            Kind.UPLOAD_INCOMPLETE,
+            Kind.UPLOAD_STALLED,
+            Kind.UPLOAD_TOO_LARGE,
+            Kind.REQUEST_MEDIA_TYPE,
+            Kind.VIDEO_CONTAINER,
+            Kind.REQUEST_INVALID,
+            Kind.VIDEO_MISSING,
+            Kind.VIDEO_EMPTY,
+            Kind.OPTIONS_INVALID,
+            Kind.STORAGE_FULL,
+            *_IDEMPOTENCY,
+        ),
+    },
+)
+async def create_job(
+    request: Request, response: Response, services: ServicesDep, idempotency_key: IdempotencyKey = None
+) -> JobView:
+    """Submit a video. It is written to disk as it arrives and refused at the first thing wrong with it."""
+    limit = services.settings.max_upload_bytes
+    refuse_early(request, services.storage, limit)
+
+    async def receive(job_id: str) -> Wanted:
+        target = await run_in_threadpool(services.storage.begin_upload, job_id)
+        form = await receive_form(request, target, services.storage, limit)
+        video = await run_in_threadpool(services.storage.finish_upload, job_id)
+        mark = fingerprint("POST /jobs", form.video_sha256, spelled(form.options))
+        return Wanted(job_id, form.options, video, form.video_bytes, mark)
+
+    return job_view(await submit(services, request, response, idempotency_key, receive))
+
+
+@router.post(
+    "/{job_id}/restart",
+    status_code=202,
+    response_model=JobView,
+    responses={
+        **_ACCEPTED,
+        **declared(
+            Kind.REQUEST_INVALID, Kind.OPTIONS_INVALID, Kind.JOB_UNFINISHED, Kind.JOB_NO_VIDEO, *_IDEMPOTENCY
+        ),
+    },
+)
+async def restart_job(
+    job_id: JobId,
+    request: Request,
+    response: Response,
+    services: ServicesDep,
+    body: RestartRequest | None = None,
+    idempotency_key: IdempotencyKey = None,
+) -> JobView:
+    """Make a new job of a finished one's video: after a failure, with other options, from a later stage.
+
+    The first job stays as it is; each has its own result and is deleted by itself.
+    """
+    wish = body or RestartRequest()
+
+    async def receive(new_id: str) -> Wanted:
+        return await run_in_threadpool(_again, services, job_id, new_id, wish)
+
+    return job_view(await submit(services, request, response, idempotency_key, receive))
+
+
+def _again(services: Services, job_id: str, new_id: str, wish: RestartRequest) -> Wanted:
+    job = services.job(job_id)
+    if job.state not in FINAL_STATES:
+        raise ProblemError(Kind.JOB_UNFINISHED, f"The job is {job.state}.")
+    options = changed_options(job.options, wish.options)
+    try:
+        video = services.storage.share_upload(job.video, new_id)
+    except FileNotFoundError:
+        raise ProblemError(Kind.JOB_NO_VIDEO) from None
+    mark = fingerprint(f"POST /jobs/{job_id}/restart", wish.from_stage or "", spelled(options))
+    return Wanted(new_id, options, video, job.video_bytes, mark, job_id, wish.from_stage)

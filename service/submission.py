@@ -1,0 +1,143 @@
+"""From a request to a queued job: at most one per Idempotency-Key, and never a row without its video."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fastapi import Request, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import ValidationError
+
+from service.jobs.idempotency import Made, Reservation, ReservationLostError, parse_key
+from service.jobs.model import LOCAL, Job, new_job_id
+from service.jobs.schemas import JobOptions
+from service.problems import Kind, ProblemError, field_errors
+from service.services import Services
+
+#: Says that the answer is about a job made by an earlier request with the same key.
+REPLAYED = "Idempotency-Replayed"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A job about to be inserted; its video is on disk under the id ``job_id``."""
+
+    job_id: str
+    options: JobOptions
+    video: str
+    video_bytes: int | None
+    fingerprint: str
+    restarted_from: str | None = None
+    from_stage: str | None = None
+
+
+_TRACEPARENT = re.compile(r"00-(?!0{32})[0-9a-f]{32}-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
+#: Receives the request's body and puts the video in its place, under the id given.
+Receive = Callable[[str], Awaitable[Wanted]]
+
+
+async def submit(
+    services: Services, request: Request, response: Response, key: str | None, receive: Receive
+) -> Job:
+    """Make the job that the request asks for, or find the one an earlier copy of the request made.
+
+    Raises ProblemError; nothing of a refused request stays on disk.
+    """
+    reservation = await run_in_threadpool(_reserve, services, key)
+    job_id = new_job_id()
+    made: Job | None = None
+    try:
+        wanted = await receive(job_id)
+        if isinstance(reservation, Made):
+            job = await run_in_threadpool(_replay, services, reservation, wanted)
+            response.headers[REPLAYED] = "true"
+        else:
+            job = made = await run_in_threadpool(_insert, services, reservation, wanted, request)
+    finally:
+        if made is None:
+            # Not awaited in a thread: a cancelled request may await nothing more.
+            services.storage.discard_upload(job_id)
+            if isinstance(reservation, Reservation):
+                services.keys.release(reservation)
+    if made is not None:
+        await run_in_threadpool(announce, services, job.id)
+    response.headers["Location"] = f"/jobs/{job.id}"
+    return job
+
+
+def announce(services: Services, job_id: str) -> None:
+    """Send the wake-up message; one that cannot be sent is left to the reconciler."""
+    if services.queue.publish(job_id):
+        services.store.mark_published(job_id)
+
+
+def fingerprint(*parts: str) -> str:
+    """What makes two requests with one key the same request."""
+    return hashlib.sha256("\x00".join(parts).encode()).hexdigest()
+
+
+def changed_options(old: Mapping[str, Any], changes: Mapping[str, Any]) -> JobOptions:
+    """The options of a restart: null sets one back to its default. Raises ProblemError (422)."""
+    merged = {name: value for name, value in {**old, **changes}.items() if value is not None}
+    try:
+        return JobOptions.model_validate(merged)
+    except ValidationError as error:
+        raise ProblemError(Kind.OPTIONS_INVALID, errors=field_errors(error.errors())) from error
+
+
+def traceparent(header: str) -> str:
+    """The W3C trace context that was sent, or a new one."""
+    if _TRACEPARENT.fullmatch(header):
+        return header
+    return f"00-{os.urandom(16).hex()}-{os.urandom(8).hex()}-00"
+
+
+def spelled(options: JobOptions) -> str:
+    """The options as one canonical text."""
+    return json.dumps(options.model_dump(exclude_none=True), sort_keys=True)
+
+
+def _reserve(services: Services, header: str | None) -> Reservation | Made | None:
+    if header is None:
+        return None
+    key = parse_key(header)
+    if key is None:
+        error = {"field": "header.idempotency-key", "message": "Not 1 to 128 visible ASCII characters."}
+        raise ProblemError(Kind.REQUEST_INVALID, errors=[error])
+    found = services.keys.reserve(LOCAL, key)
+    if found is None:
+        problem = ProblemError(Kind.IDEMPOTENCY_IN_PROGRESS, headers={"Retry-After": "5"})
+        problem.unread = True
+        raise problem
+    return found
+
+
+def _replay(services: Services, made: Made, wanted: Wanted) -> Job:
+    if made.fingerprint != wanted.fingerprint:
+        raise ProblemError(Kind.IDEMPOTENCY_MISMATCH)
+    job = services.store.get(made.job_id)
+    if job is None:
+        raise ProblemError(Kind.JOB_NOT_FOUND, "The job that this Idempotency-Key made has been deleted.")
+    return job
+
+
+def _insert(services: Services, reservation: Reservation | None, wanted: Wanted, request: Request) -> Job:
+    try:
+        return services.store.create(
+            wanted.options.model_dump(exclude_none=True),
+            wanted.video,
+            job_id=wanted.job_id,
+            video_bytes=wanted.video_bytes,
+            restarted_from=wanted.restarted_from,
+            from_stage=wanted.from_stage,
+            traceparent=traceparent(request.headers.get("traceparent", "")),
+            idempotency_key=None if reservation is None else (reservation, wanted.fingerprint),
+        )
+    except ReservationLostError:
+        raise ProblemError(Kind.IDEMPOTENCY_IN_PROGRESS, headers={"Retry-After": "1"}) from None

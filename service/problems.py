@@ -33,6 +33,30 @@ class Kind(Enum):
         "Another site's page sent this request",
         "Send changes from the service's own page or from a program.",
     )
+    ACCESS_KEY = (
+        "access.key",
+        401,
+        "This needs a key",
+        "Send `Authorization: Bearer <key>`; `mass keys create` makes one.",
+    )
+    ACCESS_SCOPE = (
+        "access.scope",
+        403,
+        "The key does not allow this",
+        "Use a key with the scope that `detail` names.",
+    )
+    ACCESS_LINK = (
+        "access.link",
+        403,
+        "The link has run out or was changed",
+        "Ask for a new one with POST /jobs/{id}/links.",
+    )
+    QUOTA = (
+        "quota.exceeded",
+        429,
+        "You have as much as you may have",
+        "Wait the seconds in Retry-After, or delete finished jobs.",
+    )
     NOT_FOUND = ("request.not_found", 404, "There is nothing at this path", "See /docs for the paths.")
     METHOD = (
         "request.method_not_allowed",

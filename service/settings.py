@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 GIB = 1024**3
@@ -27,6 +28,15 @@ class Settings(BaseSettings):
     port: int = Field(default=8000, ge=0, le=65535)
     #: Host headers answered to, besides loopback names and ``host``. "*" accepts any.
     allowed_hosts: list[str] = Field(default_factory=list)
+
+    #: Whether keys are asked for: "auto" does so everywhere but on a loopback ``host``.
+    auth: Literal["auto", "keys", "open"] = "auto"
+    #: Signs links. Empty: one made in the data directory; machines that share jobs must share it.
+    secret: SecretStr = SecretStr("")
+    #: What one owner of keys may have; 0 is no limit. Minutes: of work, on the jobs of the last 24 hours.
+    quota_jobs: int = Field(default=20, ge=0)
+    quota_bytes: int = Field(default=20 * GIB, ge=0)
+    quota_minutes: float = Field(default=600.0, ge=0)
 
     max_upload_bytes: int = Field(default=2 * GIB, gt=0)
     max_video_seconds: float = Field(default=600.0, gt=0)

@@ -14,8 +14,10 @@ from fastapi import Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import ValidationError
 
+from service.access.keys import Caller
+from service.access.quotas import QuotaError
 from service.jobs.idempotency import Made, Reservation, ReservationLostError, parse_key
-from service.jobs.model import LOCAL, Job, new_job_id
+from service.jobs.model import Job, new_job_id
 from service.jobs.schemas import JobOptions
 from service.problems import Kind, ProblemError, field_errors
 from service.services import Services
@@ -43,13 +45,18 @@ Receive = Callable[[str], Awaitable[Wanted]]
 
 
 async def submit(
-    services: Services, request: Request, response: Response, key: str | None, receive: Receive
+    services: Services,
+    request: Request,
+    response: Response,
+    caller: Caller,
+    key: str | None,
+    receive: Receive,
 ) -> Job:
     """Make the job that the request asks for, or find the one an earlier copy of the request made.
 
     Raises ProblemError; nothing of a refused request stays on disk.
     """
-    reservation = await run_in_threadpool(_reserve, services, key)
+    reservation = await run_in_threadpool(_reserve, services, caller, key)
     job_id = new_job_id()
     made: Job | None = None
     try:
@@ -58,7 +65,7 @@ async def submit(
             job = await run_in_threadpool(_replay, services, reservation, wanted)
             response.headers[REPLAYED] = "true"
         else:
-            job = made = await run_in_threadpool(_insert, services, reservation, wanted, request)
+            job = made = await run_in_threadpool(_insert, services, caller, reservation, wanted, request)
     finally:
         if made is None:
             # Not awaited in a thread: a cancelled request may await nothing more.
@@ -75,6 +82,20 @@ def announce(services: Services, job_id: str) -> None:
     """Send the wake-up message; one that cannot be sent is left to the reconciler."""
     if services.queue.publish(job_id):
         services.store.mark_published(job_id)
+
+
+def refuse_over_quota(services: Services, caller: Caller, incoming: int) -> None:
+    """Refuse before the body is read what the quota cannot hold. Raises ProblemError (429)."""
+    try:
+        services.store.check_quota(caller.owner, services.quota(caller), jobs=1, size=incoming)
+    except QuotaError as error:
+        problem = _over(error)
+        problem.unread = True
+        raise problem from error
+
+
+def _over(error: QuotaError) -> ProblemError:
+    return ProblemError(Kind.QUOTA, error.detail, headers={"Retry-After": str(error.wait)})
 
 
 def fingerprint(*parts: str) -> str:
@@ -103,14 +124,14 @@ def spelled(options: JobOptions) -> str:
     return json.dumps(options.model_dump(exclude_none=True), sort_keys=True)
 
 
-def _reserve(services: Services, header: str | None) -> Reservation | Made | None:
+def _reserve(services: Services, caller: Caller, header: str | None) -> Reservation | Made | None:
     if header is None:
         return None
     key = parse_key(header)
     if key is None:
         error = {"field": "header.idempotency-key", "message": "Not 1 to 128 visible ASCII characters."}
         raise ProblemError(Kind.REQUEST_INVALID, errors=[error])
-    found = services.keys.reserve(LOCAL, key)
+    found = services.keys.reserve(caller.owner, key)
     if found is None:
         problem = ProblemError(Kind.IDEMPOTENCY_IN_PROGRESS, headers={"Retry-After": "5"})
         problem.unread = True
@@ -127,17 +148,23 @@ def _replay(services: Services, made: Made, wanted: Wanted) -> Job:
     return job
 
 
-def _insert(services: Services, reservation: Reservation | None, wanted: Wanted, request: Request) -> Job:
+def _insert(
+    services: Services, caller: Caller, reservation: Reservation | None, wanted: Wanted, request: Request
+) -> Job:
     try:
         return services.store.create(
             wanted.options.model_dump(exclude_none=True),
             wanted.video,
             job_id=wanted.job_id,
+            owner=caller.owner,
+            quota=services.quota(caller),
             video_bytes=wanted.video_bytes,
             restarted_from=wanted.restarted_from,
             from_stage=wanted.from_stage,
             traceparent=traceparent(request.headers.get("traceparent", "")),
             idempotency_key=None if reservation is None else (reservation, wanted.fingerprint),
         )
+    except QuotaError as error:
+        raise _over(error) from error
     except ReservationLostError:
         raise ProblemError(Kind.IDEMPOTENCY_IN_PROGRESS, headers={"Retry-After": "1"}) from None

@@ -91,8 +91,7 @@ async def receive_form(
 
 def refuse_early(request: Request, storage: Storage, max_video_bytes: int) -> None:
     """Refuse, before a byte is read, what its headers show to be hopeless. Raises ProblemError."""
-    declared = request.headers.get("content-length", "")
-    length = int(declared) if declared.isdecimal() else 0
+    length = declared_length(request)
     if length > max_video_bytes + FORM_OVERHEAD:
         detail = f"The body is said to have {length} bytes; a video may have {max_video_bytes}."
         problem = ProblemError(Kind.UPLOAD_TOO_LARGE, detail)
@@ -102,6 +101,12 @@ def refuse_early(request: Request, storage: Storage, max_video_bytes: int) -> No
         return
     problem.unread = True
     raise problem
+
+
+def declared_length(request: Request) -> int:
+    """Bytes of the body as its header says; 0 when it does not."""
+    declared = request.headers.get("content-length", "")
+    return int(declared) if declared.isdecimal() else 0
 
 
 class _Form:

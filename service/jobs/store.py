@@ -11,6 +11,8 @@ from typing import Any
 
 from sqlalchemy import Engine, and_, create_engine, delete, event, func, or_, select, update
 
+from service.access import quotas
+from service.access.quotas import Quota, Usage
 from service.jobs import idempotency, journal
 from service.jobs.idempotency import Reservation
 from service.jobs.model import LOCAL, Base, Job, JobState, new_job_id
@@ -100,12 +102,13 @@ class JobStore(JobTable):
         from_stage: str | None = None,
         traceparent: str | None = None,
         idempotency_key: tuple[Reservation, str] | None = None,
+        quota: Quota | None = None,
     ) -> Job:
         """Insert a job: queued, or awaiting its upload when ``awaits_until`` says until when.
 
         ``video`` is the upload's path relative to the data directory. ``idempotency_key``: the reservation
         of the request and its fingerprint; raises ReservationLostError, and inserts nothing, when another
-        request was faster.
+        request was faster. ``quota``: raises QuotaError when the owner would have more than that.
         """
         now = self._clock()
         job = Job(
@@ -123,11 +126,21 @@ class JobStore(JobTable):
             publish_due_at=now + _PUBLISH_GRACE,
         )
         with self._session.begin() as session:
+            quotas.serialise(session, owner)
             self._insert(session, job)
             if idempotency_key is not None:
                 reservation, fingerprint = idempotency_key
                 idempotency.bind(session, reservation, fingerprint, job.id)
+            if quota is not None:
+                # After the insert, which makes this the only transaction that counts for this owner.
+                quotas.check(quotas.usage(session, owner, now), quota)
         return job
+
+    def check_quota(self, owner: str, quota: Quota, jobs: int = 0, size: int = 0) -> None:
+        """Raise QuotaError when so much more would be too much."""
+        with self._session() as session:
+            have = quotas.usage(session, owner, self._clock())
+        quotas.check(Usage(have.jobs + jobs, have.bytes + size, have.minutes), quota)
 
     def get(self, job_id: str, owner: str | None = None) -> Job | None:
         """The job as it is now, detached; None when it is unknown, deleted, or not ``owner``'s."""

@@ -8,6 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
+from service.access.gate import CallerDep
 from service.jobs.housekeeping import purge_deleted
 from service.jobs.model import JobState, is_job_id
 from service.jobs.schemas import JobPage, JobView, job_view
@@ -23,6 +24,7 @@ JobId = Annotated[str, Path(description="The id `POST /jobs` answered with.", ma
 @router.get("", responses=declared(Kind.REQUEST_INVALID))
 def list_jobs(
     services: ServicesDep,
+    caller: CallerDep,
     limit: Annotated[int, Query(ge=1, le=100)] = 20,
     cursor: Annotated[str | None, Query(max_length=64, description="`next` of the page before.")] = None,
     state: Annotated[list[JobState] | None, Query(max_length=8, description="Only jobs in these.")] = None,
@@ -31,7 +33,7 @@ def list_jobs(
     if cursor is not None and not is_job_id(cursor):
         error = {"field": "query.cursor", "message": "Not a cursor this service gave out."}
         raise ProblemError(Kind.REQUEST_INVALID, errors=[error])
-    jobs, following = services.store.page(limit, cursor, states=state or ())
+    jobs, following = services.store.page(limit, cursor, caller.sees, state or ())
     return JobPage(jobs=[job_view(job) for job in jobs], next=following)
 
 
@@ -40,9 +42,9 @@ def list_jobs(
     response_model=JobView,
     responses={304: {"description": "Unchanged since the ETag sent."}, **declared(Kind.JOB_NOT_FOUND)},
 )
-def get_job(job_id: JobId, request: Request, services: ServicesDep) -> Response:
+def get_job(job_id: JobId, request: Request, services: ServicesDep, caller: CallerDep) -> Response:
     """State, stage, progress and, if it failed, why. Poll with `If-None-Match`."""
-    body = job_view(services.job(job_id)).model_dump(mode="json")
+    body = job_view(services.job(job_id, caller)).model_dump(mode="json")
     response = JSONResponse(body, headers={"Cache-Control": "private, no-cache"})
     etag = f'"{hashlib.sha256(response.body).hexdigest()[:32]}"'
     if not_modified(request, etag):
@@ -59,11 +61,11 @@ def get_job(job_id: JobId, request: Request, services: ServicesDep) -> Response:
         **declared(Kind.JOB_NOT_FOUND, Kind.JOB_FINISHED),
     },
 )
-def cancel_job(job_id: JobId, services: ServicesDep, response: Response) -> JobView:
+def cancel_job(job_id: JobId, services: ServicesDep, caller: CallerDep, response: Response) -> JobView:
     """End a job that has not begun at once, or have a running one stopped. May be repeated."""
-    services.job(job_id)
+    services.job(job_id, caller)
     outcome = services.store.request_cancel(job_id)
-    job = services.job(job_id)
+    job = services.job(job_id, caller)
     if outcome is Cancel.FINISHED:
         raise ProblemError(Kind.JOB_FINISHED, f"The job is {job.state}.")
     response.status_code = 200 if job.state == JobState.CANCELLED else 202
@@ -71,10 +73,11 @@ def cancel_job(job_id: JobId, services: ServicesDep, response: Response) -> JobV
 
 
 @router.delete("/{job_id}", status_code=204, responses=declared(Kind.JOB_NOT_FOUND))
-def delete_job(job_id: JobId, services: ServicesDep) -> None:
+def delete_job(job_id: JobId, services: ServicesDep, caller: CallerDep) -> None:
     """Remove the job, its video and its results. A running job vanishes at once; its bytes go when its
     worker has stopped."""
-    if not is_job_id(job_id) or not services.store.delete(job_id):
+    services.job(job_id, caller)
+    if not services.store.delete(job_id):
         raise ProblemError(Kind.JOB_NOT_FOUND)
     services.pictures.drop(job_id)
     purge_deleted(services.store, services.storage)

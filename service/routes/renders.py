@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 
+from service.access.gate import CallerDep
 from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, canonical_view
 from service.problems import Kind, ProblemError, declared
 from service.routes.jobs import JobId
@@ -54,6 +55,7 @@ def render_job(
     job_id: JobId,
     request: Request,
     services: ServicesDep,
+    caller: CallerDep,
     pose: Annotated[
         str,
         Query(
@@ -85,7 +87,7 @@ def render_job(
     ] = "rgb",
 ) -> Response:
     """Render the hand. Repeated requests are answered from a cache; use `If-None-Match`."""
-    artifact = services.artifact(job_id)
+    artifact = services.artifact(job_id, caller)
     most = services.settings.max_render_pixels
     view = canonical_view(pose, camera, width, height, format, most, channel)
     part = _folder(services.storage.artifact_path(job_id, artifact), hand)

@@ -7,13 +7,15 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
+from service.access.gate import CallerDep
+from service.access.keys import Caller
 from service.jobs.model import FINAL_STATES
 from service.jobs.schemas import JobOptions, JobView, RestartRequest, job_view
 from service.problems import Kind, ProblemError, declared
 from service.routes.jobs import JobId
 from service.services import Services, ServicesDep
-from service.submission import Wanted, changed_options, fingerprint, spelled, submit
-from service.uploads import receive_form, refuse_early
+from service.submission import Wanted, changed_options, fingerprint, refuse_over_quota, spelled, submit
+from service.uploads import declared_length, receive_form, refuse_early
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
@@ -87,16 +89,22 @@ IdempotencyKey = Annotated[
             Kind.VIDEO_EMPTY,
             Kind.OPTIONS_INVALID,
             Kind.STORAGE_FULL,
+            Kind.QUOTA,
             *_IDEMPOTENCY,
         ),
     },
 )
 async def create_job(
-    request: Request, response: Response, services: ServicesDep, idempotency_key: IdempotencyKey = None
+    request: Request,
+    response: Response,
+    services: ServicesDep,
+    caller: CallerDep,
+    idempotency_key: IdempotencyKey = None,
 ) -> JobView:
     """Submit a video. It is written to disk as it arrives and refused at the first thing wrong with it."""
     limit = services.settings.max_upload_bytes
     refuse_early(request, services.storage, limit)
+    await run_in_threadpool(refuse_over_quota, services, caller, declared_length(request))
 
     async def receive(job_id: str) -> Wanted:
         target = await run_in_threadpool(services.storage.begin_upload, job_id)
@@ -105,7 +113,7 @@ async def create_job(
         mark = fingerprint("POST /jobs", form.video_sha256, spelled(form.options))
         return Wanted(job_id, form.options, video, form.video_bytes, mark)
 
-    return job_view(await submit(services, request, response, idempotency_key, receive))
+    return job_view(await submit(services, request, response, caller, idempotency_key, receive))
 
 
 @router.post(
@@ -115,7 +123,12 @@ async def create_job(
     responses={
         **_ACCEPTED,
         **declared(
-            Kind.REQUEST_INVALID, Kind.OPTIONS_INVALID, Kind.JOB_UNFINISHED, Kind.JOB_NO_VIDEO, *_IDEMPOTENCY
+            Kind.REQUEST_INVALID,
+            Kind.OPTIONS_INVALID,
+            Kind.JOB_UNFINISHED,
+            Kind.JOB_NO_VIDEO,
+            Kind.QUOTA,
+            *_IDEMPOTENCY,
         ),
     },
 )
@@ -124,6 +137,7 @@ async def restart_job(
     request: Request,
     response: Response,
     services: ServicesDep,
+    caller: CallerDep,
     body: RestartRequest | None = None,
     idempotency_key: IdempotencyKey = None,
 ) -> JobView:
@@ -134,13 +148,13 @@ async def restart_job(
     wish = body or RestartRequest()
 
     async def receive(new_id: str) -> Wanted:
-        return await run_in_threadpool(_again, services, job_id, new_id, wish)
+        return await run_in_threadpool(_again, services, caller, job_id, new_id, wish)
 
-    return job_view(await submit(services, request, response, idempotency_key, receive))
+    return job_view(await submit(services, request, response, caller, idempotency_key, receive))
 
 
-def _again(services: Services, job_id: str, new_id: str, wish: RestartRequest) -> Wanted:
-    job = services.job(job_id)
+def _again(services: Services, caller: Caller, job_id: str, new_id: str, wish: RestartRequest) -> Wanted:
+    job = services.job(job_id, caller)
     if job.state not in FINAL_STATES:
         raise ProblemError(Kind.JOB_UNFINISHED, f"The job is {job.state}.")
     options = changed_options(job.options, wish.options)

@@ -82,7 +82,7 @@ def serve(settings: Settings) -> Iterator[Live]:
     try:
         # The socket listens already: the first request waits there until the app has started.
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as http:
-            assert http.get("/healthz").json() == {"status": "ok"}
+            assert http.get("/healthz").json() == {"status": "ok"}, "it has started"
             yield Live(http, app.state.services, "127.0.0.1", port)
     finally:
         server.should_exit = True

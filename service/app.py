@@ -20,7 +20,7 @@ from service.guard import Guard
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
 from service.problems import Kind, ProblemBody, declared
 from service.rendering import Loader, load_avatar
-from service.routes import assets, jobs, links, page, renders, submission, system
+from service.routes import assets, jobs, links, page, renders, submission, system, uploads
 from service.services import open_services
 from service.settings import Settings
 
@@ -61,6 +61,7 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
         renders.router,
         assets.router,
         links.router,
+        uploads.router,
         system.router,
     ):
         app.include_router(router, responses=everywhere)

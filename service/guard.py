@@ -58,6 +58,8 @@ class Guard:
             if message["type"] == "http.response.start":
                 started = True
                 out = MutableHeaders(scope=message)
+                if scope["path"].startswith("/uploads"):
+                    out["tus-resumable"] = "1.0.0"
                 for name, value in _HEADERS.items():
                     out.setdefault(name, value)
             await send(message)

@@ -102,6 +102,54 @@ class Kind(Enum):
         "The upload is too large",
         "Send a shorter or smaller video; /capabilities names the limit.",
     )
+    UPLOAD_NOT_FOUND = (
+        "upload.not_found",
+        404,
+        "There is no such upload",
+        "Begin a new one with POST /uploads; unfinished ones are kept until Upload-Expires.",
+    )
+    UPLOAD_VERSION = (
+        "upload.version",
+        412,
+        "This version of tus is not spoken here",
+        "Send the header `Tus-Resumable: 1.0.0`.",
+    )
+    UPLOAD_HEADERS = (
+        "upload.headers",
+        400,
+        "A header of the upload is missing or wrong",
+        "Correct the header that `detail` names; OPTIONS /uploads says what is offered.",
+    )
+    UPLOAD_MEDIA_TYPE = (
+        "upload.media_type",
+        415,
+        "The body is not part of an upload",
+        "Send it as application/offset+octet-stream.",
+    )
+    UPLOAD_OFFSET = (
+        "upload.offset",
+        409,
+        "That is not where the upload stands",
+        "Ask with HEAD for the Upload-Offset and go on from there.",
+    )
+    UPLOAD_LOCKED = (
+        "upload.locked",
+        423,
+        "Another request is writing to this upload",
+        "Try again after the seconds in Retry-After.",
+    )
+    UPLOAD_CHECKSUM = (
+        "upload.checksum",
+        460,
+        "The bytes do not match their checksum",
+        "Send this part again; nothing of it was kept.",
+    )
+    UPLOAD_USED = (
+        "upload.used",
+        409,
+        "A job has been made of this upload already",
+        "Use POST /jobs/{id}/restart to make another of the same video.",
+    )
     STORAGE_FULL = (
         "storage.full",
         507,

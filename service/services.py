@@ -21,6 +21,7 @@ from service.queue import JobQueue, create_queue
 from service.rendering import Loader, RenderPool, create_pool
 from service.settings import Settings
 from service.storage import Storage, create_storage
+from service.tus.rows import UploadStore, create_uploads
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Services:
     settings: Settings
     store: JobStore
     keys: IdempotencyKeys
+    uploads: UploadStore
     storage: Storage
     queue: JobQueue
     pool: RenderPool
@@ -75,7 +77,8 @@ def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
         pictures = PictureCache(settings.render_cache_bytes)
         signer = Signer(service_secret(settings.secret.get_secret_value(), settings.data_dir))
         keys = IdempotencyKeys(store.engine)
-        yield Services(settings, store, keys, storage, queue, pool, pictures, signer)
+        uploads = create_uploads(settings, store.engine)
+        yield Services(settings, store, keys, uploads, storage, queue, pool, pictures, signer)
 
 
 async def _services(request: Request) -> Services:

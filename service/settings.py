@@ -42,6 +42,9 @@ class Settings(BaseSettings):
     max_video_seconds: float = Field(default=600.0, gt=0)
     #: Below this much free space no upload is accepted (507).
     min_free_bytes: int = Field(default=GIB, ge=0)
+    #: How long a resumable upload is kept after its last byte, and how many unfinished an owner may have.
+    upload_seconds: float = Field(default=24 * 3600.0, gt=0)
+    max_open_uploads: int = Field(default=10, ge=0)
     #: An upload without a job that nobody wrote to for this long is removed.
     orphan_upload_seconds: float = Field(default=3600.0, gt=0)
 

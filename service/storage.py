@@ -84,6 +84,10 @@ class Storage:
         folder.mkdir(mode=0o750)
         return folder / "source.part"
 
+    def upload_part(self, job_id: str) -> Path:
+        """The file that :meth:`begin_upload` named."""
+        return self._uploads / _checked(job_id) / "source.part"
+
     def finish_upload(self, job_id: str) -> str:
         """Make the written file durable and give it its name; returns the reference kept in the row."""
         part = self._uploads / _checked(job_id) / "source.part"

@@ -13,14 +13,16 @@ from typing import Any
 from fastapi import Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import ValidationError
+from sqlalchemy.exc import IntegrityError
 
 from service.access.keys import Caller
 from service.access.quotas import QuotaError
 from service.jobs.idempotency import Made, Reservation, ReservationLostError, parse_key
-from service.jobs.model import Job, new_job_id
+from service.jobs.model import Job, is_job_id, new_job_id
 from service.jobs.schemas import JobOptions
 from service.problems import Kind, ProblemError, field_errors
 from service.services import Services
+from service.tus import lifecycle
 
 #: Says that the answer is about a job made by an earlier request with the same key.
 REPLAYED = "Idempotency-Replayed"
@@ -78,6 +80,58 @@ async def submit(
     return job
 
 
+def submit_upload(
+    services: Services,
+    request: Request,
+    response: Response,
+    caller: Caller,
+    key: str | None,
+    upload_id: str,
+    options: JobOptions,
+) -> Job:
+    """Make a job of an upload, whole or not yet; it takes the upload's id. Raises ProblemError."""
+    reservation = _reserve(services, caller, key)
+    mark = fingerprint("POST /jobs", "upload", upload_id, spelled(options))
+    wanted = Wanted(upload_id, options, f"uploads/{upload_id}/source", None, mark)
+    try:
+        if isinstance(reservation, Made):
+            job = _replay(services, reservation, wanted)
+            response.headers[REPLAYED] = "true"
+        else:
+            job = _of_upload(services, caller, reservation, wanted, request)
+    finally:
+        if isinstance(reservation, Reservation):
+            services.keys.release(reservation)  # does nothing once a job is bound to it
+    response.headers["Location"] = f"/jobs/{job.id}"
+    return job
+
+
+def _of_upload(
+    services: Services, caller: Caller, reservation: Reservation | None, wanted: Wanted, request: Request
+) -> Job:
+    if is_job_id(wanted.job_id) and services.store.get(wanted.job_id, caller.sees) is not None:
+        raise ProblemError(Kind.UPLOAD_USED)
+    upload = services.uploads.get(wanted.job_id, caller.sees) if is_job_id(wanted.job_id) else None
+    if upload is None:
+        raise ProblemError(Kind.UPLOAD_NOT_FOUND)
+    try:
+        _insert(services, caller, reservation, wanted, request, awaits_upload=True)
+    except IntegrityError:
+        raise ProblemError(Kind.UPLOAD_USED) from None
+    # Looked up again: it may have been completed just before the row was there to be told.
+    upload = services.uploads.get(wanted.job_id)
+    if (
+        upload is not None
+        and upload.complete
+        and lifecycle.hand_over(services.uploads, services.store, upload.id, upload.length)
+    ):
+        announce(services, upload.id)
+    job = services.store.get(wanted.job_id)
+    if job is None:
+        raise ProblemError(Kind.JOB_NOT_FOUND)
+    return job
+
+
 def announce(services: Services, job_id: str) -> None:
     """Send the wake-up message; one that cannot be sent is left to the reconciler."""
     if services.queue.publish(job_id):
@@ -89,12 +143,13 @@ def refuse_over_quota(services: Services, caller: Caller, incoming: int) -> None
     try:
         services.store.check_quota(caller.owner, services.quota(caller), jobs=1, size=incoming)
     except QuotaError as error:
-        problem = _over(error)
+        problem = over_quota(error)
         problem.unread = True
         raise problem from error
 
 
-def _over(error: QuotaError) -> ProblemError:
+def over_quota(error: QuotaError) -> ProblemError:
+    """The answer to who wants more than allowed."""
     return ProblemError(Kind.QUOTA, error.detail, headers={"Retry-After": str(error.wait)})
 
 
@@ -149,7 +204,12 @@ def _replay(services: Services, made: Made, wanted: Wanted) -> Job:
 
 
 def _insert(
-    services: Services, caller: Caller, reservation: Reservation | None, wanted: Wanted, request: Request
+    services: Services,
+    caller: Caller,
+    reservation: Reservation | None,
+    wanted: Wanted,
+    request: Request,
+    awaits_upload: bool = False,
 ) -> Job:
     try:
         return services.store.create(
@@ -158,6 +218,7 @@ def _insert(
             job_id=wanted.job_id,
             owner=caller.owner,
             quota=services.quota(caller),
+            awaits_upload=awaits_upload,
             video_bytes=wanted.video_bytes,
             restarted_from=wanted.restarted_from,
             from_stage=wanted.from_stage,
@@ -165,6 +226,6 @@ def _insert(
             idempotency_key=None if reservation is None else (reservation, wanted.fingerprint),
         )
     except QuotaError as error:
-        raise _over(error) from error
+        raise over_quota(error) from error
     except ReservationLostError:
         raise ProblemError(Kind.IDEMPOTENCY_IN_PROGRESS, headers={"Retry-After": "1"}) from None

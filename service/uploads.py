@@ -103,6 +103,11 @@ def refuse_early(request: Request, storage: Storage, max_video_bytes: int) -> No
     raise problem
 
 
+def media_type(request: Request) -> str:
+    """The media type of the body, without its parameters."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
 def declared_length(request: Request) -> int:
     """Bytes of the body as its header says; 0 when it does not."""
     declared = request.headers.get("content-length", "")

@@ -131,8 +131,6 @@ class Job(Base):
     created_at: Mapped[float]
     started_at: Mapped[float | None] = mapped_column(default=None)
     finished_at: Mapped[float | None] = mapped_column(default=None)
-    #: While the video is awaited: when that ends.
-    upload_expires_at: Mapped[float | None] = mapped_column(default=None)
 
     #: Outbox: when the wake-up message was last sent, how often, and when it is due again.
     last_published_at: Mapped[float | None] = mapped_column(default=None)

@@ -41,6 +41,15 @@ class JobOptions(BaseModel):
     )
 
 
+class UploadedJob(BaseModel):
+    """A job of a video that comes, or came, through `POST /uploads`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    upload: str = Field(max_length=64, description="The id of the upload, which becomes the job's.")
+    options: JobOptions = Field(default_factory=JobOptions)
+
+
 class ErrorView(BaseModel):
     """Why a job failed."""
 
@@ -72,6 +81,7 @@ class Links(BaseModel):
 
     self: str
     cancel: str | None = None
+    upload: str | None = None
     restart: str | None = None
     render: str | None = None
     assets: str | None = None
@@ -149,6 +159,7 @@ def job_view(job: Job) -> JobView:
         error=error,
         links=Links(
             self=path,
+            upload=f"/uploads/{job.id}" if job.state == JobState.AWAITING_UPLOAD else None,
             cancel=None if job.state in FINAL_STATES else f"{path}/cancel",
             restart=f"{path}/restart" if job.state in FINAL_STATES - {JobState.EXPIRED} else None,
             render=f"{path}/render" if done else None,

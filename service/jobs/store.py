@@ -97,14 +97,14 @@ class JobStore(JobTable):
         job_id: str | None = None,
         video_bytes: int | None = None,
         owner: str = LOCAL,
-        awaits_until: float | None = None,
+        awaits_upload: bool = False,
         restarted_from: str | None = None,
         from_stage: str | None = None,
         traceparent: str | None = None,
         idempotency_key: tuple[Reservation, str] | None = None,
         quota: Quota | None = None,
     ) -> Job:
-        """Insert a job: queued, or awaiting its upload when ``awaits_until`` says until when.
+        """Insert a job: queued, or awaiting its upload.
 
         ``video`` is the upload's path relative to the data directory. ``idempotency_key``: the reservation
         of the request and its fingerprint; raises ReservationLostError, and inserts nothing, when another
@@ -114,11 +114,10 @@ class JobStore(JobTable):
         job = Job(
             id=job_id or new_job_id(now),
             owner=owner,
-            state=JobState.QUEUED if awaits_until is None else JobState.AWAITING_UPLOAD,
+            state=JobState.AWAITING_UPLOAD if awaits_upload else JobState.QUEUED,
             options=dict(options),
             video=video,
             video_bytes=video_bytes,
-            upload_expires_at=awaits_until,
             restarted_from=restarted_from,
             from_stage=from_stage,
             traceparent=traceparent,
@@ -187,7 +186,7 @@ class JobStore(JobTable):
     def upload_arrived(self, job_id: str, video_bytes: int) -> bool:
         """The awaited video is there and whole: queue the job. False when it no longer awaits one."""
         due = self._clock() + _PUBLISH_GRACE
-        values = {"video_bytes": video_bytes, "publish_due_at": due, "upload_expires_at": None}
+        values = {"video_bytes": video_bytes, "publish_due_at": due}
         return bool(self._move(JobState.QUEUED, Job.id == job_id, *_awaiting(), **values))
 
     def upload_refused(self, job_id: str, code: str, message: str, advice: str) -> bool:
@@ -394,10 +393,9 @@ class JobStore(JobTable):
         self._lost(Job.attempt >= limit, Job.state == JobState.RUNNING, silent)
         return [job.id for job in self._requeue(Job.state == JobState.RUNNING, silent)]
 
-    def expire_uploads(self) -> list[str]:
-        """End the jobs whose video did not arrive in time; returns their ids."""
-        late = Job.upload_expires_at < self._clock()
-        return [job.id for job in self._finish(JobState.EXPIRED, *_awaiting(), late)]
+    def expire_upload(self, job_id: str) -> bool:
+        """The awaited video did not arrive in time. False when the job no longer awaits one."""
+        return bool(self._finish(JobState.EXPIRED, Job.id == job_id, *_awaiting()))
 
     # How
 

@@ -15,6 +15,7 @@ from service.jobs.schemas import JobPage, JobView, job_view
 from service.jobs.store import Cancel
 from service.problems import Kind, ProblemError, declared
 from service.services import ServicesDep, not_modified
+from service.tus import lifecycle
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
@@ -68,6 +69,8 @@ def cancel_job(job_id: JobId, services: ServicesDep, caller: CallerDep, response
     job = services.job(job_id, caller)
     if outcome is Cancel.FINISHED:
         raise ProblemError(Kind.JOB_FINISHED, f"The job is {job.state}.")
+    if outcome is Cancel.CANCELLED:
+        lifecycle.end(services.uploads, services.store, services.storage, job_id)
     response.status_code = 200 if job.state == JobState.CANCELLED else 202
     return job_view(job)
 
@@ -79,5 +82,6 @@ def delete_job(job_id: JobId, services: ServicesDep, caller: CallerDep) -> None:
     services.job(job_id, caller)
     if not services.store.delete(job_id):
         raise ProblemError(Kind.JOB_NOT_FOUND)
+    services.uploads.remove(job_id)
     services.pictures.drop(job_id)
     purge_deleted(services.store, services.storage)

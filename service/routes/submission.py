@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Request, Response
 from fastapi.concurrency import run_in_threadpool
+from pydantic import ValidationError
 
 from service.access.gate import CallerDep
 from service.access.keys import Caller
 from service.jobs.model import FINAL_STATES
-from service.jobs.schemas import JobOptions, JobView, RestartRequest, job_view
-from service.problems import Kind, ProblemError, declared
+from service.jobs.schemas import JobOptions, JobView, RestartRequest, UploadedJob, job_view
+from service.problems import Kind, ProblemError, declared, field_errors
 from service.routes.jobs import JobId
 from service.services import Services, ServicesDep
-from service.submission import Wanted, changed_options, fingerprint, refuse_over_quota, spelled, submit
-from service.uploads import declared_length, receive_form, refuse_early
+from service.submission import (
+    Wanted,
+    changed_options,
+    fingerprint,
+    refuse_over_quota,
+    spelled,
+    submit,
+    submit_upload,
+)
+from service.uploads import declared_length, media_type, receive_form, refuse_early
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
@@ -42,7 +52,8 @@ _FORM: dict[str, Any] = {
                 },
             },
             "encoding": {"options": {"contentType": "application/json"}},
-        }
+        },
+        "application/json": {"schema": {"$ref": "#/components/schemas/UploadedJob"}},
     },
 }
 
@@ -59,6 +70,8 @@ _ACCEPTED: dict[int | str, dict[str, Any]] = {
     }
 }
 _IDEMPOTENCY = (Kind.IDEMPOTENCY_IN_PROGRESS, Kind.IDEMPOTENCY_MISMATCH, Kind.JOB_NOT_FOUND)
+
+_MAX_JSON = 64 * 1024
 
 IdempotencyKey = Annotated[
     str | None,
@@ -90,6 +103,8 @@ IdempotencyKey = Annotated[
             Kind.OPTIONS_INVALID,
             Kind.STORAGE_FULL,
             Kind.QUOTA,
+            Kind.UPLOAD_NOT_FOUND,
+            Kind.UPLOAD_USED,
             *_IDEMPOTENCY,
         ),
     },
@@ -101,7 +116,12 @@ async def create_job(
     caller: CallerDep,
     idempotency_key: IdempotencyKey = None,
 ) -> JobView:
-    """Submit a video. It is written to disk as it arrives and refused at the first thing wrong with it."""
+    """Submit a video: in a form, written to disk as it arrives and refused at the first thing wrong with it,
+    or as the id of an upload, which may still be under way (the job awaits it then)."""
+    if media_type(request) == "application/json":
+        wish = await _uploaded(request)
+        make = partial(submit_upload, services, request, response, caller, idempotency_key)
+        return job_view(await run_in_threadpool(make, wish.upload, wish.options))
     limit = services.settings.max_upload_bytes
     refuse_early(request, services.storage, limit)
     await run_in_threadpool(refuse_over_quota, services, caller, declared_length(request))
@@ -114,6 +134,20 @@ async def create_job(
         return Wanted(job_id, form.options, video, form.video_bytes, mark)
 
     return job_view(await submit(services, request, response, caller, idempotency_key, receive))
+
+
+async def _uploaded(request: Request) -> UploadedJob:
+    body = b""
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > _MAX_JSON:
+            problem = ProblemError(Kind.UPLOAD_TOO_LARGE, f"The JSON may have {_MAX_JSON} bytes.")
+            problem.unread = True
+            raise problem
+    try:
+        return UploadedJob.model_validate_json(body)
+    except ValidationError as error:
+        raise ProblemError(Kind.REQUEST_INVALID, errors=field_errors(error.errors())) from error
 
 
 @router.post(

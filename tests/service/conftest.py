@@ -96,6 +96,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
         data_dir=tmp_path_factory.mktemp("data"),
         max_upload_bytes=1_000_000,
         min_free_bytes=0,
+        max_open_uploads=0,
         render_queue=1,
         render_timeout=3.0,
         render_load_timeout=20.0,

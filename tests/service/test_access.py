@@ -37,14 +37,17 @@ class Keyed:
     live: Live
     keys: dict[str, str]
     job: str
+    upload: str
 
     def send(self, who: str, method: str, path: str, **arguments: object) -> httpx.Response:
-        headers = {"Authorization": f"Bearer {self.keys[who]}"} if who != "anonymous" else {}
+        headers = {"Tus-Resumable": "1.0.0"}
+        if who != "anonymous":
+            headers["Authorization"] = f"Bearer {self.keys[who]}"
         return self.live.http.request(method, path, headers=headers, **arguments)  # type: ignore[arg-type]
 
     def at(self, path: str) -> str:
         """The path with its names filled in: Ann's finished job, and things that exist in it."""
-        names = {"job_id": self.job, "name": "report.json", "code": "video.empty"}
+        names = {"upload_id": self.upload, "job_id": self.job, "name": "report.json", "code": "video.empty"}
         return path.replace(":path", "").format_map(_Names(names))
 
 
@@ -78,8 +81,9 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
         keys["garbage"] = "mass_not_a_key"
         live.http.headers["Authorization"] = f"Bearer {keys['owner']}"
         job, _ = live.finished()
+        upload = live.http.post("/uploads", headers={"Tus-Resumable": "1.0.0", "Upload-Length": "9"})
         del live.http.headers["Authorization"]
-        yield Keyed(live, keys, job)
+        yield Keyed(live, keys, job, upload.headers["Location"].rpartition("/")[2])
 
 
 def test_there_is_something_to_test() -> None:
@@ -92,7 +96,10 @@ def test_there_is_something_to_test() -> None:
 def test_without_a_good_key_nothing_is_answered(keyed: Keyed, who: str, method: str, path: str) -> None:
     before = keyed.live.files()
     answer = keyed.send(who, method, keyed.at(path), content=b"x" * 1000)
-    problem(answer, 401, "access.key")
+    if method == "HEAD":
+        assert (answer.status_code, answer.content) == (401, b"")
+    else:
+        problem(answer, 401, "access.key")
     assert answer.headers["WWW-Authenticate"].startswith("Bearer")
     assert keyed.live.files() == before
 
@@ -113,11 +120,14 @@ def test_what_is_anothers_does_not_exist(keyed: Keyed, method: str, path: str) -
 
 
 @pytest.mark.parametrize("who", ["owner", "reader", "admin"])
-@pytest.mark.parametrize(("method", "path"), [(m, p) for m, p in PRIVATE if m == "GET" and "{" in p])
+@pytest.mark.parametrize(
+    ("method", "path"), [(m, p) for m, p in PRIVATE if m in ("GET", "HEAD") and "{" in p]
+)
 def test_the_owner_and_the_administrator_see_it(keyed: Keyed, who: str, method: str, path: str) -> None:
     answer = keyed.send(who, method, keyed.at(path))
     assert answer.status_code not in (401, 403), answer.text
     if answer.status_code == 404:
+        assert method == "GET"
         assert answer.json()["code"] != "job.not_found"
 
 

@@ -39,7 +39,7 @@ class JobLife(RuleBasedStateMachine):
         self.now = 1_000.0
         settings = Settings(data_dir=Path(self.folder.name), max_attempts=MAX_ATTEMPTS)
         self.store = create_store(settings, lambda: self.now)
-        self.id = self.store.create({}, "v", awaits_until=self.now + 50 if awaits else None).id
+        self.id = self.store.create({}, "v", awaits_upload=awaits).id
         self.tokens = ["never-issued"]
         self.before = self.row()
         self.published = 0
@@ -125,19 +125,21 @@ class JobLife(RuleBasedStateMachine):
             case _:
                 assert (said, self.row().state) == (Cancel.FINISHED, before)
 
-    @rule(whole=st.booleans())
-    def upload_ends(self, whole: bool) -> None:
+    @rule(how=st.sampled_from(["arrives", "expires", "refused"]))
+    def upload_ends(self, how: str) -> None:
         before = self.row().state
-        if whole:
-            done = self.store.upload_arrived(self.id, 7)
-        else:
-            done = self.store.upload_refused(self.id, "video.unsupported_container", "m", "a")
+        match how:
+            case "arrives":
+                done = self.store.upload_arrived(self.id, 7)
+            case "expires":
+                done = self.store.expire_upload(self.id)
+            case _:
+                done = self.store.upload_refused(self.id, "video.unsupported_container", "m", "a")
         assert done == (before == JobState.AWAITING_UPLOAD)
 
     @rule()
     def reconcile(self) -> None:
         self.store.requeue_expired_leases()
-        self.store.expire_uploads()
         for job_id in self.store.due_for_publish():
             self.store.mark_published(job_id)
 

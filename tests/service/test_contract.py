@@ -146,7 +146,9 @@ def test_async_routes_await_and_do_not_block() -> None:
                 continue
             found += 1
             inside = [*ast.walk(function)]
-            assert any(isinstance(node, ast.Await) for node in inside), f"{path.name}: {function.name}"
+            assert any(isinstance(node, ast.Await | ast.AsyncFor) for node in inside), (
+                f"{path.name}: {function.name}"
+            )
             for node in inside:
                 if isinstance(node, ast.Call):
                     name = node.func.attr if isinstance(node.func, ast.Attribute) else ast.unparse(node.func)

@@ -20,6 +20,7 @@ def test_a_job_is_followed_from_queue_to_failure(live: Live) -> None:
     assert seen["links"] == {
         "self": f"/jobs/{job_id}",
         "cancel": f"/jobs/{job_id}/cancel",
+        "upload": None,
         "restart": None,
         "render": None,
         "assets": None,

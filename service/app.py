@@ -20,7 +20,7 @@ from service.guard import Guard
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
 from service.problems import Kind, ProblemBody, declared
 from service.rendering import Loader, load_avatar
-from service.routes import assets, jobs, links, page, renders, submission, system, uploads
+from service.routes import assets, jobs, links, page, progress, renders, submission, system, uploads
 from service.services import open_services
 from service.settings import Settings
 
@@ -58,6 +58,7 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
     for router in (
         submission.router,
         jobs.router,
+        progress.router,
         renders.router,
         assets.router,
         links.router,

@@ -224,6 +224,18 @@ class Kind(Enum):
         "This Idempotency-Key came with another request before",
         "Use a new key for each new request.",
     )
+    PREVIEW_NONE = (
+        "preview.none",
+        404,
+        "There is no preview yet",
+        "The first one comes when the engine has begun to colour the hand.",
+    )
+    STREAMS = (
+        "events.too_many",
+        429,
+        "You have too many event streams open",
+        "Close one, or poll GET /jobs/{id} with If-None-Match.",
+    )
     ASSET_NOT_FOUND = (
         "asset.not_found",
         404,

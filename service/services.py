@@ -22,6 +22,7 @@ from service.rendering import Loader, RenderPool, create_pool
 from service.settings import Settings
 from service.storage import Storage, create_storage
 from service.tus.rows import UploadStore, create_uploads
+from service.watching import StreamSlots
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Services:
     pool: RenderPool
     pictures: PictureCache
     signer: Signer
+    streams: StreamSlots
 
     def job(self, job_id: str, caller: Caller) -> Job:
         """The job, if the caller may see it. Raises ProblemError (404): others' jobs do not exist."""
@@ -78,7 +80,18 @@ def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
         signer = Signer(service_secret(settings.secret.get_secret_value(), settings.data_dir))
         keys = IdempotencyKeys(store.engine)
         uploads = create_uploads(settings, store.engine)
-        yield Services(settings, store, keys, uploads, storage, queue, pool, pictures, signer)
+        yield Services(
+            settings,
+            store,
+            keys,
+            uploads,
+            storage,
+            queue,
+            pool,
+            pictures,
+            signer,
+            StreamSlots(settings.max_streams),
+        )
 
 
 async def _services(request: Request) -> Services:

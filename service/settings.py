@@ -56,6 +56,9 @@ class Settings(BaseSettings):
     republish_max_seconds: float = Field(default=600.0, gt=0)
     job_timeout: float = Field(default=2 * 3600.0, gt=0)
 
+    #: Event streams one owner may have open in one API process.
+    max_streams: int = Field(default=50, ge=1)
+
     render_workers: int = Field(default=1, ge=1)
     render_timeout: float = Field(default=10.0, gt=0)
     #: The first picture of a job loads the avatar (and, in a fresh process, the engine itself).

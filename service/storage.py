@@ -34,6 +34,9 @@ _HAND = re.compile(r"(?:left|right)/")
 _PREVIEW = re.compile(r"previews/[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(png|jpg|webp)")
 #: Without these an attempt has not finished.
 OUTPUTS = ("avatar.safetensors", "report.json", "surfels.ply")
+#: What GET /jobs/{id}/preview shows: the result, or what the engine puts there while it works.
+_LATEST = ("previews/pose-rest.png", "previews/live.jpg")
+_MAX_PREVIEW = 4 * 1024**2
 _PREVIEW_TYPES = {"png": "image/png", "jpg": "image/jpeg", "webp": "image/webp"}
 _ARTIFACT = re.compile(r"[0-9]{1,6}-[0-9a-zA-Z]{1,64}")
 _MANIFEST = "assets.json"
@@ -183,6 +186,21 @@ class Storage:
         if found is None or linked or not stat.S_ISREG(path.lstat().st_mode):
             return None
         return found, path
+
+    def preview(self, job_id: str, artifact: str) -> tuple[bytes, str] | None:
+        """The latest picture of an attempt, finished or not, and its media type; None when there is none."""
+        folder = self._artifact(job_id, artifact)
+        for name in _LATEST:
+            for path in (folder / name, folder / "right" / name, folder / "left" / name):
+                try:
+                    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+                except OSError:
+                    continue
+                with os.fdopen(descriptor, "rb") as file:
+                    picture = file.read(_MAX_PREVIEW)
+                if picture:
+                    return picture, _PREVIEW_TYPES[name.rpartition(".")[2]]
+        return None
 
     def drop_attempts(self, job_id: str, keep: str | None = None) -> None:
         """Remove the output of every attempt except ``keep``."""

@@ -156,6 +156,7 @@ class Supervisor:
             grace = {_Stop.CANCEL: _CANCEL_GRACE, _Stop.SHUTDOWN: _SHUTDOWN_GRACE}.get(stop, 0.0)
         finally:
             code = engine.stop(grace)
+            self._pass_on(claim, engine)
         match stop:
             case _Stop.LOST:
                 return Outcome.LOST
@@ -184,6 +185,7 @@ class Supervisor:
             answer = lease.check()
             if answer is not Heartbeat.OK:
                 return _Stop.CANCEL if answer is Heartbeat.CANCEL else _Stop.LOST
+            self._pass_on(claim, engine)
             if engine.progress is not shown:
                 shown = engine.progress
                 self._show(claim, engine.progress)
@@ -204,6 +206,15 @@ class Supervisor:
         except SQLAlchemyError as error:
             # Progress may be missed; the lease decides how long to go on without a database.
             log.warning("job %s: progress not written (%s)", claim.job_id, type(error).__name__)
+
+    def _pass_on(self, claim: Claim, engine: EngineProcess) -> None:
+        """Give the job's owner what the engine said."""
+        lines = engine.new_lines()
+        if lines:
+            try:
+                self._store.log(claim.job_id, claim.token, lines)
+            except SQLAlchemyError as error:
+                log.warning("job %s: log not written (%s)", claim.job_id, type(error).__name__)
 
     def _conclude(self, claim: Claim, lease: Lease, engine: EngineProcess, code: int, run: Path) -> Outcome:
         said = engine.failure

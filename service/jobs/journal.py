@@ -89,7 +89,9 @@ def write_lines(session: Session, job: Job, lines: Sequence[str], at: float) -> 
     """Add log lines, cut to length; beyond :data:`MAX_LINES` of one job they are dropped."""
     have = session.scalar(select(func.count()).where(JobLog.job_id == job.id)) or 0
     for line in lines[: max(MAX_LINES - have, 0)]:
-        session.add(JobLog(job_id=job.id, at=at, attempt=job.attempt, text=line[:MAX_LINE]))
+        # Control characters would act on the terminal of whoever reads the log.
+        text = "".join(filter(str.isprintable, line))[:MAX_LINE]
+        session.add(JobLog(job_id=job.id, at=at, attempt=job.attempt, text=text))
 
 
 def lines_after(session: Session, job_id: str, after: int, limit: int) -> list[JobLog]:

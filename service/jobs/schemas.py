@@ -83,6 +83,9 @@ class Links(BaseModel):
     cancel: str | None = None
     upload: str | None = None
     restart: str | None = None
+    events: str
+    logs: str
+    preview: str
     render: str | None = None
     assets: str | None = None
 
@@ -162,6 +165,9 @@ def job_view(job: Job) -> JobView:
             upload=f"/uploads/{job.id}" if job.state == JobState.AWAITING_UPLOAD else None,
             cancel=None if job.state in FINAL_STATES else f"{path}/cancel",
             restart=f"{path}/restart" if job.state in FINAL_STATES - {JobState.EXPIRED} else None,
+            events=f"{path}/events",
+            logs=f"{path}/logs",
+            preview=f"{path}/preview",
             render=f"{path}/render" if done else None,
             assets=f"{path}/assets" if done else None,
         ),

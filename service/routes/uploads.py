@@ -30,7 +30,7 @@ _METADATA_KEY = re.compile(r"[\x21-\x2b\x2d-\x7e]{1,64}")
 _MAX_NUMBER = 2**53
 
 
-async def _version(
+def _version(
     tus_resumable: Annotated[str | None, Header(description="`1.0.0`", examples=[VERSION])] = None,
 ) -> None:
     if tus_resumable != VERSION:

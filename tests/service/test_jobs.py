@@ -22,6 +22,7 @@ def test_a_job_is_followed_from_queue_to_failure(live: Live) -> None:
         "cancel": f"/jobs/{job_id}/cancel",
         "upload": None,
         "restart": None,
+        **{name: f"/jobs/{job_id}/{name}" for name in ("events", "logs", "preview")},
         "render": None,
         "assets": None,
     }

@@ -38,6 +38,11 @@ def test_a_job_runs_to_success_and_its_files_are_published(running: Bench) -> No
     published = {asset.name: asset.bytes for asset in running.storage.assets(job_id, job.artifact)}
     assert published == {name: len(content) for name, content in FILES.items()}
     assert len(running.starts(job_id)) == 1
+    assert [line.text for line in running.store.logs(job_id)] == ["stage track"]
+    said = [(entry.kind, entry.data["state"]) for entry in running.store.events(job_id)]
+    assert said[:2] == [("state", "queued"), ("state", "running")]
+    assert said[-1] == ("state", "succeeded")
+    assert ("progress", "running") in said
 
 
 def test_the_engine_gets_the_options_and_none_of_the_services_secrets(running: Bench) -> None:

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mass_engine.avatar import Avatar, row_pose
 from mass_engine.errors import BadArgumentError
@@ -24,7 +26,7 @@ from mass_engine.fitting.report import (
     peak_memory_bytes,
     versions,
 )
-from mass_engine.fitting.trainer import FitResult, fit_hand, schedule_for
+from mass_engine.fitting.trainer import FitResult, Show, fit_hand, schedule_for
 from mass_engine.options import FitOptions
 from mass_engine.preprocess import Clip, prepare_hand
 from mass_engine.progress import FIT_STAGES, Progress, ProgressMeter
@@ -54,9 +56,13 @@ def fit(
     options: FitOptions | None = None,
     report: Report | None = None,
     warn: Warn | None = None,
+    show: Show | None = None,
 ) -> FitOutcome:
-    """Reconstruct the hand in ``video``. Raises EngineError when the video cannot be used, BadArgumentError
-    ``options.invalid`` for ``side="both"``: see :func:`fit_hands`."""
+    """Reconstruct the hand in ``video``. ``show`` gets a look at it now and then.
+
+    Raises EngineError when the video cannot be used, BadArgumentError ``options.invalid`` for
+    ``side="both"``: see :func:`fit_hands`.
+    """
     options = options or FitOptions()
     if options.side == "both":
         raise BadArgumentError(
@@ -65,7 +71,7 @@ def fit(
     notes = _Notes(warn)
     meter = ProgressMeter(report or (lambda _: None))
     found = survey(video, options, meter, notes)
-    return _fit_hand(video, found, found.hands[0], options, meter, notes)
+    return _fit_hand(video, found, found.hands[0], options, meter, notes, show)
 
 
 def fit_hands(
@@ -73,6 +79,7 @@ def fit_hands(
     options: FitOptions | None = None,
     report: Report | None = None,
     warn: Warn | None = None,
+    show: Show | None = None,
 ) -> Iterator[FitOutcome]:
     """Reconstruct both hands of the person in ``video`` (or the one there is), the right one first.
 
@@ -92,7 +99,7 @@ def fit_hands(
         note = f"{hand.side} hand" if len(found.hands) > 1 else ""
         part = ProgressMeter(whole.part(first + number * share, share, note), own)
         part.seconds |= meter.seconds
-        yield _fit_hand(video, found, hand, options, part, notes)
+        yield _fit_hand(video, found, hand, options, part, notes, show)
 
 
 class _Notes:
@@ -129,7 +136,13 @@ class _Whole:
 
 
 def _fit_hand(
-    video: Path, found: Survey, hand: SurveyedHand, options: FitOptions, meter: ProgressMeter, notes: _Notes
+    video: Path,
+    found: Survey,
+    hand: SurveyedHand,
+    options: FitOptions,
+    meter: ProgressMeter,
+    notes: _Notes,
+    show: Show | None,
 ) -> FitOutcome:
     clip = prepare_hand(video, found, hand, options, meter)
     meter.update("convert", 0.0)
@@ -141,6 +154,7 @@ def _fit_hand(
         schedule_for(options.preset),
         options.seed,
         lambda fraction, message: meter.update("fit", fraction, message),
+        show,
     )
     kind, rows = _evaluate(result, clip, meter)
     tracks = _tracks(video.name, clip, result)
@@ -194,7 +208,7 @@ def fit_to_directory(
 ) -> FitReport:
     """:func:`fit`, with everything the command line promises written to ``out``."""
     out.mkdir(parents=True, exist_ok=True)
-    return _write(fit(video, options, report, warn), out)
+    return _write(fit(video, options, report, warn, _live_preview(out)), out)
 
 
 def fit_hands_to_directory(
@@ -210,15 +224,29 @@ def fit_hands_to_directory(
     for side in SIDES:
         shutil.rmtree(out / side, ignore_errors=True)
     reports, tracks = [], []
-    for outcome in fit_hands(video, options, report, warn):
+    for outcome in fit_hands(video, options, report, warn, _live_preview(out)):
         folder = out / outcome.report.side
         folder.mkdir()
         reports.append(_write(outcome, folder))
         tracks.append(outcome.tracks)
     write_tracks(tracks, out / "tracks.json")
+    shutil.rmtree(out / "previews", ignore_errors=True)
     both = HandsReport.of(reports)
     both.write(out)
     return both
+
+
+def _live_preview(out: Path) -> Show:
+    """Keeps the latest look at the hand in ``out/previews/live.jpg``, which the results replace."""
+
+    def show(picture: NDArray[np.uint8]) -> None:
+        folder = out / "previews"
+        folder.mkdir(exist_ok=True)
+        part = folder / "live.part.jpg"
+        cv2.imwrite(str(part), picture[..., ::-1])
+        part.replace(folder / "live.jpg")  # whoever reads it sees one picture or the other
+
+    return show
 
 
 def _write(outcome: FitOutcome, out: Path) -> FitReport:

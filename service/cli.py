@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from service.client import DEFAULT_URL, AssetInfo, JobInfo, MassClient, ServiceError
+from service.keys_command import add_parser as add_keys_parser
 from service.processes import hide_memory
 from service.progress import FollowBar, transfer_bar
 
@@ -260,6 +261,7 @@ def _parser() -> argparse.ArgumentParser:
     download.add_argument("name", nargs="?", help="one file (default: all)")
     download.add_argument("--out", type=Path, default=Path(), help="folder (default: here)")
     command("cancel", _cancel, "Stop a job.", job=True)
+    add_keys_parser(commands)
     command("delete", _delete, "Remove a job and everything of it.", job=True)
     return parser
 

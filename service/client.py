@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from urllib.parse import quote
 import httpx
 
 DEFAULT_URL = "http://127.0.0.1:8000"
-FINAL = frozenset({"succeeded", "failed", "cancelled"})
+FINAL = frozenset({"succeeded", "failed", "cancelled", "expired"})
 
 #: Told how many bytes of how many have been sent or received.
 BytesProgress = Callable[[int, int], None]
@@ -75,8 +76,12 @@ class MassClient:
         url: str = DEFAULT_URL,
         timeout: float = 60.0,
         transport: httpx.BaseTransport | None = None,
+        key: str | None = None,
     ) -> None:
-        self._http = httpx.Client(base_url=url, timeout=timeout, transport=transport)
+        """``key``: for a service that asks for one (default: ``$MASS_KEY``)."""
+        key = key or os.environ.get("MASS_KEY")
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._http = httpx.Client(base_url=url, timeout=timeout, transport=transport, headers=headers)
 
     def __enter__(self) -> Self:
         return self

@@ -33,6 +33,30 @@ class Kind(Enum):
         "Another site's page sent this request",
         "Send changes from the service's own page or from a program.",
     )
+    ACCESS_KEY = (
+        "access.key",
+        401,
+        "This needs a key",
+        "Send `Authorization: Bearer <key>`; `mass keys create` makes one.",
+    )
+    ACCESS_SCOPE = (
+        "access.scope",
+        403,
+        "The key does not allow this",
+        "Use a key with the scope that `detail` names.",
+    )
+    ACCESS_LINK = (
+        "access.link",
+        403,
+        "The link has run out or was changed",
+        "Ask for a new one with POST /jobs/{id}/links.",
+    )
+    QUOTA = (
+        "quota.exceeded",
+        429,
+        "You have as much as you may have",
+        "Wait the seconds in Retry-After, or delete finished jobs.",
+    )
     NOT_FOUND = ("request.not_found", 404, "There is nothing at this path", "See /docs for the paths.")
     METHOD = (
         "request.method_not_allowed",
@@ -77,6 +101,54 @@ class Kind(Enum):
         413,
         "The upload is too large",
         "Send a shorter or smaller video; /capabilities names the limit.",
+    )
+    UPLOAD_NOT_FOUND = (
+        "upload.not_found",
+        404,
+        "There is no such upload",
+        "Begin a new one with POST /uploads; unfinished ones are kept until Upload-Expires.",
+    )
+    UPLOAD_VERSION = (
+        "upload.version",
+        412,
+        "This version of tus is not spoken here",
+        "Send the header `Tus-Resumable: 1.0.0`.",
+    )
+    UPLOAD_HEADERS = (
+        "upload.headers",
+        400,
+        "A header of the upload is missing or wrong",
+        "Correct the header that `detail` names; OPTIONS /uploads says what is offered.",
+    )
+    UPLOAD_MEDIA_TYPE = (
+        "upload.media_type",
+        415,
+        "The body is not part of an upload",
+        "Send it as application/offset+octet-stream.",
+    )
+    UPLOAD_OFFSET = (
+        "upload.offset",
+        409,
+        "That is not where the upload stands",
+        "Ask with HEAD for the Upload-Offset and go on from there.",
+    )
+    UPLOAD_LOCKED = (
+        "upload.locked",
+        423,
+        "Another request is writing to this upload",
+        "Try again after the seconds in Retry-After.",
+    )
+    UPLOAD_CHECKSUM = (
+        "upload.checksum",
+        460,
+        "The bytes do not match their checksum",
+        "Send this part again; nothing of it was kept.",
+    )
+    UPLOAD_USED = (
+        "upload.used",
+        409,
+        "A job has been made of this upload already",
+        "Use POST /jobs/{id}/restart to make another of the same video.",
     )
     STORAGE_FULL = (
         "storage.full",
@@ -126,7 +198,43 @@ class Kind(Enum):
         "job.finished",
         409,
         "The job is over already",
-        "Nothing to cancel; use DELETE to remove it.",
+        "There is nothing to cancel; DELETE removes it.",
+    )
+    JOB_UNFINISHED = (
+        "job.unfinished",
+        409,
+        "The job is not over yet",
+        "Cancel it first, or wait for its end.",
+    )
+    JOB_NO_VIDEO = (
+        "job.no_video",
+        409,
+        "The job's video is no longer here",
+        "Submit the video again.",
+    )
+    IDEMPOTENCY_IN_PROGRESS = (
+        "idempotency.in_progress",
+        409,
+        "The same request is being answered now",
+        "Wait for its answer, or send it again after the seconds in Retry-After.",
+    )
+    IDEMPOTENCY_MISMATCH = (
+        "idempotency.mismatch",
+        422,
+        "This Idempotency-Key came with another request before",
+        "Use a new key for each new request.",
+    )
+    PREVIEW_NONE = (
+        "preview.none",
+        404,
+        "There is no preview yet",
+        "The first one comes when the engine has begun to colour the hand.",
+    )
+    STREAMS = (
+        "events.too_many",
+        429,
+        "You have too many event streams open",
+        "Close one, or poll GET /jobs/{id} with If-None-Match.",
     )
     ASSET_NOT_FOUND = (
         "asset.not_found",
@@ -158,6 +266,12 @@ class Kind(Enum):
         422,
         "The picture would be too large",
         "Ask for fewer pixels; /capabilities names the limit.",
+    )
+    RENDER_NO_HAND = (
+        "render.no_hand",
+        404,
+        "The job has no such hand",
+        "Leave `hand` out, or submit the video with the option `side` set to `both`.",
     )
     RENDER_REFUSED = ("render.refused", 422, "The engine refused the request", "Change the pose or camera.")
     RENDER_FAILED = (

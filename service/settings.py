@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 GIB = 1024**3
@@ -33,10 +33,22 @@ class Settings(BaseSettings):
     #: Host headers answered to, besides loopback names and ``host``. "*" accepts any.
     allowed_hosts: list[str] = Field(default_factory=list)
 
+    #: Whether keys are asked for: "auto" does so everywhere but on a loopback ``host``.
+    auth: Literal["auto", "keys", "open"] = "auto"
+    #: Signs links. Empty: one made in the data directory; machines that share jobs must share it.
+    secret: SecretStr = SecretStr("")
+    #: What one owner of keys may have; 0 is no limit. Minutes: of work, on the jobs of the last 24 hours.
+    quota_jobs: int = Field(default=20, ge=0)
+    quota_bytes: int = Field(default=20 * GIB, ge=0)
+    quota_minutes: float = Field(default=600.0, ge=0)
+
     max_upload_bytes: int = Field(default=2 * GIB, gt=0)
     max_video_seconds: float = Field(default=600.0, gt=0)
     #: Below this much free space no upload is accepted (507).
     min_free_bytes: int = Field(default=GIB, ge=0)
+    #: How long a resumable upload is kept after its last byte, and how many unfinished an owner may have.
+    upload_seconds: float = Field(default=24 * 3600.0, gt=0)
+    max_open_uploads: int = Field(default=10, ge=0)
     #: An upload without a job that nobody wrote to for this long is removed.
     orphan_upload_seconds: float = Field(default=3600.0, gt=0)
 
@@ -47,6 +59,9 @@ class Settings(BaseSettings):
     republish_min_seconds: float = Field(default=60.0, gt=0)
     republish_max_seconds: float = Field(default=600.0, gt=0)
     job_timeout: float = Field(default=2 * 3600.0, gt=0)
+
+    #: Event streams one owner may have open in one API process.
+    max_streams: int = Field(default=50, ge=1)
 
     render_workers: int = Field(default=1, ge=1)
     render_timeout: float = Field(default=10.0, gt=0)

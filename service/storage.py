@@ -29,7 +29,14 @@ ASSET_TYPES: dict[str, str] = {
     "tracks.json": "application/json",
     "surfels.ply": "application/octet-stream",
 }
+#: A job for both hands has the files of each in a folder of its own.
+_HAND = re.compile(r"(?:left|right)/")
 _PREVIEW = re.compile(r"previews/[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(png|jpg|webp)")
+#: Without these an attempt has not finished.
+OUTPUTS = ("avatar.safetensors", "report.json", "surfels.ply")
+#: What GET /jobs/{id}/preview shows: the result, or what the engine puts there while it works.
+_LATEST = ("previews/pose-rest.png", "previews/live.jpg")
+_MAX_PREVIEW = 4 * 1024**2
 _PREVIEW_TYPES = {"png": "image/png", "jpg": "image/jpeg", "webp": "image/webp"}
 _ARTIFACT = re.compile(r"[0-9]{1,6}-[0-9a-zA-Z]{1,64}")
 _MANIFEST = "assets.json"
@@ -47,6 +54,7 @@ class Asset:
 
 def media_type(name: str) -> str | None:
     """The media type of an asset that may be served; None for every other name."""
+    name = _HAND.sub("", name, count=1) if _HAND.match(name) else name
     if _PREVIEW.fullmatch(name):
         return _PREVIEW_TYPES[name.rsplit(".", 1)[1]]
     return ASSET_TYPES.get(name)
@@ -80,6 +88,10 @@ class Storage:
         folder.mkdir(mode=0o750)
         return folder / "source.part"
 
+    def upload_part(self, job_id: str) -> Path:
+        """The file that :meth:`begin_upload` named."""
+        return self._uploads / _checked(job_id) / "source.part"
+
     def finish_upload(self, job_id: str) -> str:
         """Make the written file durable and give it its name; returns the reference kept in the row."""
         part = self._uploads / _checked(job_id) / "source.part"
@@ -93,6 +105,23 @@ class Storage:
     def discard_upload(self, job_id: str) -> None:
         """Forget an upload, complete or not."""
         shutil.rmtree(self._uploads / _checked(job_id), ignore_errors=True)
+
+    def share_upload(self, reference: str, job_id: str) -> str:
+        """Give a second job the video of a first one; returns the new reference.
+
+        Each has a name of its own for the same bytes: removing one leaves the other. Raises
+        FileNotFoundError when the video has been removed.
+        """
+        source = self.source(reference)
+        part = self.begin_upload(job_id)
+        try:
+            os.link(source, part)
+        except FileNotFoundError:
+            self.discard_upload(job_id)
+            raise
+        except OSError:  # a file system without links
+            shutil.copyfile(source, part)
+        return self.finish_upload(job_id)
 
     def source(self, reference: str) -> Path:
         """The video a row refers to (``Job.video``)."""
@@ -136,7 +165,8 @@ class Storage:
                 _fsync(path)
         manifest = folder / _MANIFEST
         manifest.write_text(json.dumps([asdict(asset) for asset in assets]))
-        for path in (manifest, *(p for p in (folder / "previews",) if p.is_dir()), folder, folder.parent):
+        folders = sorted((p for p in folder.rglob("*") if p.is_dir() and not p.is_symlink()), reverse=True)
+        for path in (manifest, *folders, folder, folder.parent):
             _fsync(path)
         _fsync(self._jobs)
         return assets
@@ -151,10 +181,32 @@ class Storage:
         if media_type(name) is None:
             return None
         found = next((asset for asset in self.assets(job_id, artifact) if asset.name == name), None)
-        path = self._artifact(job_id, artifact) / name
-        if found is None or path.parent.is_symlink() or not stat.S_ISREG(path.lstat().st_mode):
+        folder = self._artifact(job_id, artifact)
+        path = folder / name
+        linked = any(parent.is_symlink() for parent in path.parents if parent.is_relative_to(folder))
+        if found is None or linked or not stat.S_ISREG(path.lstat().st_mode):
             return None
         return found, path
+
+    def preview(self, job_id: str, artifact: str) -> tuple[bytes, str] | None:
+        """The latest picture of an attempt, finished or not, and its media type; None when there is none."""
+        folder = self._artifact(job_id, artifact)
+        for name in _LATEST:
+            for path in (folder / name, folder / "right" / name, folder / "left" / name):
+                try:
+                    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+                except OSError:
+                    continue
+                with os.fdopen(descriptor, "rb") as file:
+                    picture = file.read(_MAX_PREVIEW)
+                if picture:
+                    return picture, _PREVIEW_TYPES[name.rpartition(".")[2]]
+        return None
+
+    def attempts(self, job_id: str) -> list[Path]:
+        """The directories of the job's attempts, whatever became of them."""
+        folder = self._jobs / _checked(job_id)
+        return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
 
     def drop_attempts(self, job_id: str, keep: str | None = None) -> None:
         """Remove the output of every attempt except ``keep``."""
@@ -173,6 +225,13 @@ class Storage:
         if _ARTIFACT.fullmatch(artifact) is None:
             raise ValueError(f"not an artifact: {artifact!r}")
         return self._jobs / _checked(job_id) / artifact
+
+
+def missing_outputs(folder: Path) -> list[str]:
+    """What a finished attempt in ``folder`` lacks: its files, or those of each hand it made."""
+    hands = [name for name in ("left", "right") if (folder / name).is_dir()]
+    needed = [f"{hand}/{name}" for hand in hands for name in OUTPUTS] or list(OUTPUTS)
+    return [name for name in (*needed, "report.json") if not (folder / name).is_file()]
 
 
 def create_storage(settings: Settings) -> Storage:

@@ -32,6 +32,7 @@ FLAGS: dict[str, str] = {
 
 _MAX_LINE = 64 * 1024
 _TAIL_LINES = 40
+_UNREAD_LINES = 500
 
 
 @dataclass(frozen=True)
@@ -64,11 +65,13 @@ def fit_command(
     options: Mapping[str, str | int | float | None],
     *,
     resume: bool = False,
+    from_stage: str | None = None,
     max_seconds: float | None = None,
 ) -> list[str]:
     """The command that fits ``video`` into the directory ``run``, or goes on with what lies there already.
 
-    A video longer than ``max_seconds`` is to be refused. Raises UnknownOptionError.
+    ``from_stage``: of what lies there, only what came before this stage counts. A video longer than
+    ``max_seconds`` is to be refused. Raises UnknownOptionError.
     """
     unknown = sorted(set(options) - set(FLAGS))
     if unknown:
@@ -79,6 +82,8 @@ def fit_command(
         flags.append(f"--max-seconds={max_seconds:g}")
     if resume:
         flags.append("--resume")
+        if from_stage is not None:
+            flags.append(f"--from-stage={from_stage}")
     return [*engine, "fit", str(video), "--out", str(run), "--json", *flags]
 
 
@@ -89,6 +94,7 @@ class EngineProcess:
         self.progress: EngineProgress | None = None
         self.failure: EngineFailure | None = None
         self._tail: deque[str] = deque(maxlen=_TAIL_LINES)
+        self._said: deque[str] = deque(maxlen=_UNREAD_LINES)
         self._closed = threading.Event()
         self._process = launch(
             command,
@@ -115,6 +121,14 @@ class EngineProcess:
     def tail(self) -> str:
         """The last lines it wrote that were no events."""
         return "\n".join(self._tail)
+
+    def new_lines(self) -> list[str]:
+        """What it said to the job's owner since the last call: stages, warnings, its error."""
+        lines = []
+        with contextlib.suppress(IndexError):
+            while True:
+                lines.append(self._said.popleft())
+        return lines
 
     def wait(self, seconds: float) -> int | None:
         """The exit code, negative for a signal, or None while it runs; returns early when it ends."""
@@ -145,13 +159,17 @@ class EngineProcess:
         event = _parse(line)
         kind = event.get("type")
         if kind == "progress":
-            self.progress = _progress(event)
+            before, self.progress = self.progress, _progress(event)
+            if before is None or before.stage != self.progress.stage:
+                self._said.append(f"stage {self.progress.stage}")
         elif kind == "error":
             self.failure = EngineFailure(
                 _text(event, "code", 80), _text(event, "message", 1000), _text(event, "advice", 1000)
             )
+            self._said.append(f"error {self.failure.code}: {self.failure.message}")
         elif kind == "warning":
             log.info("engine %d warns: %s %s", self.pid, event.get("code"), event.get("message"))
+            self._said.append(f"warning {_text(event, 'code', 80)}: {_text(event, 'message', 900)}")
         elif kind != "done":
             self._tail.append(line.decode(errors="replace").rstrip()[:500])
 

@@ -21,7 +21,7 @@ from service.jobs.model import FINAL_STATES
 from service.jobs.store import LOST_ADVICE, Claim, Heartbeat, JobStore
 from service.queue import JobQueue
 from service.settings import Settings
-from service.storage import Storage
+from service.storage import Storage, missing_outputs
 from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, fit_command
 from worker.run_directory import drop_checkpoint, has_checkpoint, prepare
 from worker.sandbox import Sandbox
@@ -34,9 +34,6 @@ _CANCEL_SECONDS = 1.0
 #: How long a cancelled engine, and one stopped by a shutdown, may take to end by itself.
 _CANCEL_GRACE = 2.0
 _SHUTDOWN_GRACE = 5.0
-
-#: Without these an exit code of 0 is not believed.
-OUTPUTS = ("avatar.safetensors", "report.json", "surfels.ply")
 
 _EXIT_BAD_ARGUMENTS = 2
 _EXIT_BAD_INPUT = 3
@@ -180,6 +177,7 @@ class Supervisor:
                 run,
                 claim.options,
                 resume=resumed,
+                from_stage=claim.from_stage,
                 max_seconds=self._settings.max_video_seconds,
             )
         except UnknownOptionError as error:
@@ -193,6 +191,7 @@ class Supervisor:
         finally:
             code = engine.stop(grace)
             self._sandbox.close(run)
+            self._pass_on(claim, engine)
         match stop:
             case _Stop.LOST:
                 return Outcome.LOST
@@ -224,6 +223,7 @@ class Supervisor:
             answer = lease.check()
             if answer is not Heartbeat.OK:
                 return _Stop.CANCEL if answer is Heartbeat.CANCEL else _Stop.LOST
+            self._pass_on(claim, engine)
             if engine.progress is not shown:
                 shown = engine.progress
                 self._show(claim, engine.progress)
@@ -245,10 +245,19 @@ class Supervisor:
             # Progress may be missed; the lease decides how long to go on without a database.
             log.warning("job %s: progress not written (%s)", claim.job_id, type(error).__name__)
 
+    def _pass_on(self, claim: Claim, engine: EngineProcess) -> None:
+        """Give the job's owner what the engine said."""
+        lines = engine.new_lines()
+        if lines:
+            try:
+                self._store.log(claim.job_id, claim.token, lines)
+            except SQLAlchemyError as error:
+                log.warning("job %s: log not written (%s)", claim.job_id, type(error).__name__)
+
     def _conclude(self, claim: Claim, lease: Lease, engine: EngineProcess, code: int, run: Path) -> Outcome:
         said = engine.failure
         if code == 0:
-            missing = [name for name in OUTPUTS if not (run / name).is_file()]
+            missing = missing_outputs(run)
             if not missing:
                 return self._succeed(claim, lease)
             log.error("job %s: the engine left no %s", claim.job_id, ", ".join(missing))

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mass_engine.avatar import Avatar, SourceFrames
@@ -15,7 +17,7 @@ from mass_engine.fitting.gauss_newton import Registrar, Round
 from mass_engine.fitting.geometry import GeometryFit, GeometryPass, GeometryWeights
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.registration import RegistrationWeights
-from mass_engine.fitting.subject import Appearance, Shape
+from mass_engine.fitting.subject import Appearance, Shape, render_row
 from mass_engine.fitting.views import View
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
@@ -34,6 +36,8 @@ BACKGROUND_WEIGHT, FOREARM_WEIGHT = 0.2, 0.004
 RIM_BIAS = 0.4
 #: Frames whose mean texture the others are registered against.
 REGISTRATION_FRAMES = 100
+#: Longer side of a look at the hand during the fit, pixels.
+LOOK_SIDE = 320
 #: The steps of every frame in the sweep.
 SWEEP = tuple(Round(side, betas=False, offsets=False) for side in (160, 320, 640))
 
@@ -93,6 +97,10 @@ def schedule_for(preset: str) -> Schedule:
     return Schedule(2, 1, 8, (first, second), outline, texture, appearance, heldout, 100, 640)
 
 
+#: Told what the hand looks like now, uint8 [H,W,3].
+Show = Callable[[NDArray[np.uint8]], None]
+
+
 @dataclass(frozen=True)
 class FitResult:
     """The avatar and what the fit knows about itself. ``table`` rows follow the views given."""
@@ -113,8 +121,11 @@ def fit_hand(
     schedule: Schedule,
     seed: int,
     progress: Callable[[float, str], None],
+    show: Show | None = None,
 ) -> FitResult:
     """Fit one hand to ``views`` (in time order) from the poses ``start`` [F] with one shape.
+
+    ``show`` gets a look at the hand now and then during stage two; the fit is the same with or without it.
 
     Held-out views give only their silhouette and landmarks, only to their own pose, and only after
     everything else is finished.
@@ -157,8 +168,9 @@ def fit_hand(
     evidence = second.gather(light, schedule.gather_side, schedule.gather_frames)
     appearance = Appearance.plain(binding.count, light, schedule.harmonics)
     appearance.albedo = fill_unseen(evidence, binding, 0.5)
+    looks = _Looks(second, appearance, show)
     for step, share in zip(schedule.appearance, shares.appearance, strict=True):
-        second.run(appearance, step, progress=part(share, f"stage 2 at {step.side} px"))
+        second.run(appearance, step, progress=looks.beside(part(share, f"stage 2 at {step.side} px")))
         done += share
 
     _place_heldout(views, table, start)
@@ -218,6 +230,37 @@ def _register(
         look = Appearance.plain(fine.count, fit.light)
         look.albedo = fill_unseen(gatherer.gather(fit.light, turn.side, REGISTRATION_FRAMES), fine, 0.5)
         fit.step(turn, fine, look)
+
+
+class _Looks:
+    """Small pictures of the clearest frame on white, a tenth of a pass apart."""
+
+    def __init__(self, fit: AppearanceFit, appearance: Appearance, show: Show | None) -> None:
+        self._fit, self._appearance, self._show = fit, appearance, show
+        best = _best_frame(fit.views)
+        self._row = next(row for row, view in enumerate(fit.views) if view.index == best)
+
+    def beside(self, progress: Callable[[float], None]) -> Callable[[float], None]:
+        """``progress``, with a look whenever the next one is due."""
+        due = 0.0
+
+        def report(fraction: float) -> None:
+            nonlocal due
+            progress(fraction)
+            if self._show is not None and fraction >= due:
+                due = fraction + 0.1
+                self._show(self._picture())
+
+        return report
+
+    def _picture(self) -> NDArray[np.uint8]:
+        fit, camera = self._fit, self._fit.views[self._row].level(LOOK_SIDE).camera
+        with torch.no_grad():
+            surfels = fit.surfels(self._row)
+            white = torch.ones(3)
+            out = render_row(self._appearance, surfels, 0, fit.binding.bones, camera, fit.raster, white)
+            picture: NDArray[np.uint8] = (255 * out.rgb.clamp(0, 1)).round().to(torch.uint8).numpy()
+        return picture
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ import logging
 
 from service.jobs.store import JobStore
 from service.storage import Storage
+from service.tus import lifecycle
+from service.tus.rows import UploadStore
 
 log = logging.getLogger(__name__)
 
@@ -29,8 +31,11 @@ def purge_deleted(store: JobStore, storage: Storage) -> list[str]:
 
 def sweep_uploads(store: JobStore, storage: Storage, older_than: float) -> list[str]:
     """Remove uploads without a job that nobody wrote to for ``older_than`` seconds; returns their ids."""
+    # Resumable uploads have rows and a time of their own, which these rows say.
+    uploads = UploadStore(store.engine, older_than)
+    expired = lifecycle.sweep(uploads, store, storage)
     idle = {*storage.idle_uploads(older_than)}
-    orphans = sorted(idle - store.known(idle))
+    orphans = sorted(idle - store.known(idle) - uploads.known(idle))
     for job_id in orphans:
         storage.discard_upload(job_id)
-    return orphans
+    return sorted({*orphans, *expired})

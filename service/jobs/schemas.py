@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,7 +15,10 @@ class JobOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    side: Literal["auto", "left", "right"] = Field(default="auto", description="Which hand to reconstruct.")
+    side: Literal["auto", "left", "right", "both"] = Field(
+        default="auto",
+        description="Which hand to reconstruct; `both` makes an avatar of each hand of the person.",
+    )
     preset: Literal["draft", "auto", "full"] = Field(
         default="auto", description="How much time to spend on quality."
     )
@@ -41,12 +44,39 @@ class JobOptions(BaseModel):
     )
 
 
+class UploadedJob(BaseModel):
+    """A job of a video that comes, or came, through `POST /uploads`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    upload: str = Field(max_length=64, description="The id of the upload, which becomes the job's.")
+    options: JobOptions = Field(default_factory=JobOptions)
+
+
 class ErrorView(BaseModel):
     """Why a job failed."""
 
     code: str = Field(examples=["video.no_hand"])
     message: str
     advice: str
+    stage: str | None = Field(description="What the engine was doing; null when no worker had it.")
+
+
+class RestartRequest(BaseModel):
+    """What to do differently this time; both may be left out."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    from_stage: Literal["read", "track", "segment", "align", "convert", "fit", "evaluate"] | None = Field(
+        default=None,
+        description="Begin here if the first job left a checkpoint of what comes before, else as late as its "
+        "checkpoints allow, which may be the beginning. Absent: from the beginning.",
+    )
+    options: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Options to change (see `JobOptions`); null sets one back to its default.",
+        examples=[{"preset": "full", "fov": None}],
+    )
 
 
 class Links(BaseModel):
@@ -54,6 +84,11 @@ class Links(BaseModel):
 
     self: str
     cancel: str | None = None
+    upload: str | None = None
+    restart: str | None = None
+    events: str
+    logs: str
+    preview: str
     render: str | None = None
     assets: str | None = None
 
@@ -63,13 +98,13 @@ class JobView(BaseModel):
 
     id: str
     state: JobState
-    cancel_requested: bool = Field(description="A running job that is being stopped.")
     stage: str | None = Field(description="What the engine does now: read, track, segment, align, ...")
     fraction: float = Field(ge=0, le=1, description="Of the whole job; never falls within one attempt.")
     time_left: float | None = Field(description="Seconds, as the engine estimates it.")
     message: str
     attempt: int = Field(description="Which try this is; a try lost to a crash is repeated.")
     options: JobOptions
+    restarted_from: str | None = Field(description="The job whose video this one uses again.")
     video_bytes: int | None
     created_at: datetime
     started_at: datetime | None
@@ -107,17 +142,22 @@ def job_view(job: Job) -> JobView:
     done = job.state == JobState.SUCCEEDED
     error = None
     if job.error_code is not None:
-        error = ErrorView(code=job.error_code, message=job.error_message or "", advice=job.error_advice or "")
+        error = ErrorView(
+            code=job.error_code,
+            message=job.error_message or "",
+            advice=job.error_advice or "",
+            stage=job.stage,
+        )
     return JobView(
         id=job.id,
         state=job.state,
-        cancel_requested=job.cancel_requested and job.state == JobState.RUNNING,
         stage=job.stage,
         fraction=job.fraction,
         time_left=job.time_left,
         message=job.message,
         attempt=job.attempt,
         options=JobOptions.model_validate(job.options),
+        restarted_from=job.restarted_from,
         video_bytes=job.video_bytes,
         created_at=_moment(job.created_at),
         started_at=None if job.started_at is None else _moment(job.started_at),
@@ -125,7 +165,12 @@ def job_view(job: Job) -> JobView:
         error=error,
         links=Links(
             self=path,
+            upload=f"/uploads/{job.id}" if job.state == JobState.AWAITING_UPLOAD else None,
             cancel=None if job.state in FINAL_STATES else f"{path}/cancel",
+            restart=f"{path}/restart" if job.state in FINAL_STATES - {JobState.EXPIRED} else None,
+            events=f"{path}/events",
+            logs=f"{path}/logs",
+            preview=f"{path}/preview",
             render=f"{path}/render" if done else None,
             assets=f"{path}/assets" if done else None,
         ),

@@ -73,8 +73,10 @@ def test_only_the_api_is_published_and_only_on_loopback(compose: dict[str, Any])
 
 def test_api_and_worker_share_one_image_user_volume_and_broker(compose: dict[str, Any]) -> None:
     api, worker = (compose["services"][name] for name in OURS)
-    for key in ("image", "build", "user", "volumes", "depends_on", "environment"):
+    for key in ("image", "build", "user", "volumes", "depends_on"):
         assert api[key] == worker[key]
+    open_on_loopback = {"MASS_AUTH": "${MASS_AUTH:-open}"}
+    assert api["environment"] == {**worker["environment"], **open_on_loopback}
     assert api["volumes"] == ["data:/data"]
     assert api["depends_on"] == {"redis": {"condition": "service_healthy"}}
     host = re.fullmatch(r"redis://([^:/]+):6379/0", api["environment"]["MASS_REDIS_URL"])

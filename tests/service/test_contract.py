@@ -74,12 +74,16 @@ def test_the_page_and_the_docs_are_served_with_a_strict_policy(live: Live) -> No
     assert "<script>" not in page.text
     assert "http://" not in page.text
     assert "https://" not in page.text
-    for name in ("page.js", "style.css"):
-        assert f"/web/{name}" in page.text
+    docs = live.http.get("/docs")
+    assert docs.headers["content-security-policy"] == page.headers["content-security-policy"]
+    assert "<script>" not in docs.text
+    assert "://" not in docs.text
+    for name in ("page.js", "docs.js", "style.css"):
+        assert f"/web/{name}" in page.text + docs.text
         asset = live.http.get(f"/web/{name}")
         assert asset.status_code == 200
         assert "innerHTML" not in asset.text
-    assert live.http.get("/docs").status_code == 200
+        assert "://" not in asset.text
     assert live.http.get("/openapi.json").json() == json.loads(document())
 
 
@@ -142,7 +146,9 @@ def test_async_routes_await_and_do_not_block() -> None:
                 continue
             found += 1
             inside = [*ast.walk(function)]
-            assert any(isinstance(node, ast.Await) for node in inside), f"{path.name}: {function.name}"
+            assert any(isinstance(node, ast.Await | ast.AsyncFor) for node in inside), (
+                f"{path.name}: {function.name}"
+            )
             for node in inside:
                 if isinstance(node, ast.Call):
                     name = node.func.attr if isinstance(node.func, ast.Attribute) else ast.unparse(node.func)

@@ -166,6 +166,7 @@ class Bench:
         gated: bool = False,
         options: dict[str, Any] | None = None,
         queue: str = "cpu",
+        restarted_from: str | None = None,
         **more: Any,
     ) -> str:
         """A queued row with its video, not published. ``gated``: the engine waits for :meth:`open_gate`."""
@@ -175,7 +176,7 @@ class Bench:
             plan["gate"] = str(self.notebook / f"{job_id}.gate")
         self.storage.begin_upload(job_id).write_bytes(b"PLAN:" + json.dumps(plan).encode())
         video = self.storage.finish_upload(job_id)
-        self.store.create(options or {}, video, job_id=job_id, queue=queue)
+        self.store.create(options or {}, video, job_id=job_id, queue=queue, restarted_from=restarted_from)
         return job_id
 
     def submit_file(self, video: Path) -> str:

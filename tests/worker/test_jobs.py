@@ -38,6 +38,11 @@ def test_a_job_runs_to_success_and_its_files_are_published(running: Bench) -> No
     published = {asset.name: asset.bytes for asset in running.storage.assets(job_id, job.artifact)}
     assert published == {name: len(content) for name, content in FILES.items()}
     assert len(running.starts(job_id)) == 1
+    assert [line.text for line in running.store.logs(job_id)] == ["stage track"]
+    said = [(entry.kind, entry.data["state"]) for entry in running.store.events(job_id)]
+    assert said[:2] == [("state", "queued"), ("state", "running")]
+    assert said[-1] == ("state", "succeeded")
+    assert ("progress", "running") in said
 
 
 def test_the_engine_gets_the_options_and_none_of_the_services_secrets(running: Bench) -> None:
@@ -121,7 +126,7 @@ def test_cancel_ends_a_running_engine(running: Bench, mode: str) -> None:
     job = running.until(job_id, "cancelled")
     assert job.artifact is None
     assert running.notes(job_id, "end") == []
-    assert running.store.request_cancel(job_id) is Cancel.FINISHED
+    assert running.store.request_cancel(job_id) is Cancel.CANCELLED
 
 
 def test_deleting_a_running_job_ends_its_engine_and_leaves_no_file(running: Bench) -> None:

@@ -84,3 +84,15 @@ def test_an_engine_whose_worker_is_stopped_cannot_write_into_the_next_attempt(be
     folder = bench.settings.data_dir / "jobs" / job_id
     wait_for("one directory is left", lambda: [p.name for p in folder.iterdir()] == [job.artifact])
     assert bench.row(job_id).artifact == job.artifact
+
+
+def test_a_restarted_job_goes_on_from_what_the_first_one_left(bench: Bench) -> None:
+    bench.worker()
+    first = bench.submit("steps", gated=True)
+    _halfway(bench, first)
+    bench.store.request_cancel(first)
+    bench.until(first, "cancelled")
+    second = bench.job("steps", restarted_from=first)
+    bench.publish(second)
+    assert bench.until(second, "succeeded").attempt == 1
+    assert (_begun(bench, second), _steps(bench, second)) == (["resume"], [*range(5, 10)])

@@ -22,11 +22,17 @@ class Settings(BaseSettings):
     data_dir: Path = Path("data")
     #: SQLAlchemy URL of the job database; empty means a SQLite file in ``data_dir``.
     database_url: str = ""
+    #: Where complete files are kept for other machines to see (service/blobs.py): empty for ``data_dir``
+    #: itself, ``file:///shared/folder`` or ``s3://bucket/prefix?endpoint=https://host``.
+    storage_url: str = ""
     #: Broker; None means the embedded one (see ``broker_url`` in service/queue.py).
     redis_url: str | None = None
     #: Where a job goes that does not say which device it needs, and what a worker here takes.
     default_queue: Literal["cpu", "gpu"] = "cpu"
     worker_queues: list[Literal["cpu", "gpu"]] = Field(default_factory=lambda: [*_QUEUES], min_length=1)
+
+    #: Lines for people, or one JSON object a line with the job and the trace it is about.
+    log_format: Literal["text", "json"] = "text"
 
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)
@@ -51,6 +57,12 @@ class Settings(BaseSettings):
     max_open_uploads: int = Field(default=10, ge=0)
     #: An upload without a job that nobody wrote to for this long is removed.
     orphan_upload_seconds: float = Field(default=3600.0, gt=0)
+
+    #: Retention, counted from a job's end; 0 keeps for ever. The video of a job that is over, the checkpoint
+    #: of one that did not succeed, and the job itself with its results.
+    keep_video_seconds: float = Field(default=30 * 86400.0, ge=0)
+    keep_checkpoint_seconds: float = Field(default=86400.0, ge=0)
+    keep_job_seconds: float = Field(default=0.0, ge=0)
 
     lease_seconds: float = Field(default=60.0, gt=0)
     heartbeat_seconds: float = Field(default=10.0, gt=0)

@@ -8,6 +8,7 @@ An attempt's directory is written by one worker only, and becomes the job's resu
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -15,9 +16,10 @@ import re
 import shutil
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from service.jobs.model import is_job_id
 from service.settings import Settings
@@ -39,7 +41,8 @@ _LATEST = ("previews/pose-rest.png", "previews/live.jpg")
 _MAX_PREVIEW = 4 * 1024**2
 _PREVIEW_TYPES = {"png": "image/png", "jpg": "image/jpeg", "webp": "image/webp"}
 _ARTIFACT = re.compile(r"[0-9]{1,6}-[0-9a-zA-Z]{1,64}")
-_MANIFEST = "assets.json"
+#: The list of a result's assets, written last.
+MANIFEST = "assets.json"
 
 
 @dataclass(frozen=True)
@@ -130,6 +133,14 @@ class Storage:
             raise ValueError(f"not an upload: {reference!r}")
         return path
 
+    def fetch_source(self, reference: str, run: Path) -> Path:  # noqa: ARG002
+        """The video a row refers to, as a file that the attempt in ``run`` may read."""
+        return self.source(reference)
+
+    def drop_video(self, job_id: str) -> None:
+        """Remove a job's video and nothing else. Raises OSError when it could not be removed."""
+        _remove(self._uploads / _checked(job_id))
+
     def idle_uploads(self, older_than: float) -> Iterator[str]:
         """Ids of upload directories nobody wrote to for ``older_than`` seconds."""
         limit = time.time() - older_than
@@ -163,7 +174,7 @@ class Storage:
             if kind is not None and stat.S_ISREG(path.lstat().st_mode):
                 assets.append(Asset(name, path.stat().st_size, _sha256(path), kind))
                 _fsync(path)
-        manifest = folder / _MANIFEST
+        manifest = folder / MANIFEST
         manifest.write_text(json.dumps([asdict(asset) for asset in assets]))
         folders = sorted((p for p in folder.rglob("*") if p.is_dir() and not p.is_symlink()), reverse=True)
         for path in (manifest, *folders, folder, folder.parent):
@@ -173,7 +184,7 @@ class Storage:
 
     def assets(self, job_id: str, artifact: str) -> list[Asset]:
         """What :meth:`publish` listed."""
-        manifest = self._artifact(job_id, artifact) / _MANIFEST
+        manifest = self._artifact(job_id, artifact) / MANIFEST
         return [Asset(**entry) for entry in json.loads(manifest.read_text())]
 
     def open_asset(self, job_id: str, artifact: str, name: str) -> tuple[Asset, Path] | None:
@@ -203,6 +214,34 @@ class Storage:
                     return picture, _PREVIEW_TYPES[name.rpartition(".")[2]]
         return None
 
+    def published(self, job_id: str, artifact: str) -> Path:
+        """The directory of a published result, with all of its files in it."""
+        return self._artifact(job_id, artifact)
+
+    def save_checkpoint(self, job_id: str, folder: Path) -> None:
+        """Keep an interrupted engine's state for another machine; on a disk that all share it is kept."""
+
+    def load_checkpoint(self, job_id: str, folder: Path) -> bool:  # noqa: ARG002
+        """Fetch what another machine kept; False when there is nothing but what lies here."""
+        return False
+
+    def drop_checkpoint(self, job_id: str) -> None:
+        """Forget what was kept."""
+
+    def local_jobs(self, older_than: float) -> list[str]:
+        """Ids of the jobs with a directory here, last changed more than ``older_than`` seconds ago."""
+        limit = time.time() - older_than
+        found = []
+        for folder in self._jobs.iterdir():
+            with contextlib.suppress(FileNotFoundError):
+                if is_job_id(folder.name) and folder.stat().st_mtime < limit:
+                    found.append(folder.name)
+        return sorted(found)
+
+    def drop_local(self, job_id: str) -> None:
+        """Remove a job's directory on this machine. Raises OSError when something could not be removed."""
+        _remove(self._jobs / _checked(job_id))
+
     def attempts(self, job_id: str) -> list[Path]:
         """The directories of the job's attempts, whatever became of them."""
         folder = self._jobs / _checked(job_id)
@@ -218,8 +257,7 @@ class Storage:
     def delete_job(self, job_id: str) -> None:
         """Remove every byte of the job. Raises OSError when something could not be removed."""
         for folder in (self._uploads / _checked(job_id), self._jobs / job_id):
-            if folder.exists():
-                shutil.rmtree(folder)
+            _remove(folder)
 
     def _artifact(self, job_id: str, artifact: str) -> Path:
         if _ARTIFACT.fullmatch(artifact) is None:
@@ -235,7 +273,12 @@ def missing_outputs(folder: Path) -> list[str]:
 
 
 def create_storage(settings: Settings) -> Storage:
-    """The storage of ``settings``."""
+    """The storage of ``settings``. Raises BlobError for a ``storage_url`` of no known kind."""
+    if settings.storage_url:
+        from service.blobs import open_blobs
+        from service.object_storage import ObjectStorage
+
+        return ObjectStorage(settings.data_dir, open_blobs(settings.storage_url), settings.min_free_bytes)
     return Storage(settings.data_dir, settings.min_free_bytes)
 
 
@@ -243,6 +286,25 @@ def _checked(job_id: str) -> str:
     if not is_job_id(job_id):
         raise ValueError(f"not a job id: {job_id!r}")
     return job_id
+
+
+def _remove(folder: Path) -> None:
+    """Remove a tree whatever rights an engine left its folders. Raises OSError when something remains."""
+
+    def again(_function: Callable[..., Any], path: str, _: Any) -> None:
+        if not os.path.lexists(path):
+            return
+        with contextlib.suppress(OSError):
+            os.chmod(os.path.dirname(path), 0o700)
+            if not os.path.islink(path):
+                os.chmod(path, 0o700)
+        if os.path.isdir(path) and not os.path.islink(path):
+            shutil.rmtree(path)
+        else:
+            os.unlink(path)
+
+    if folder.exists():
+        shutil.rmtree(folder, onerror=again)
 
 
 def _sha256(path: Path) -> str:

@@ -33,6 +33,7 @@ FLAGS: dict[str, str] = {
 _MAX_LINE = 64 * 1024
 _TAIL_LINES = 40
 _UNREAD_LINES = 500
+_MAX_WARNINGS = 100
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,7 @@ class EngineProcess:
     def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
         self.progress: EngineProgress | None = None
         self.failure: EngineFailure | None = None
+        self.warnings: list[dict[str, str]] = []
         self._tail: deque[str] = deque(maxlen=_TAIL_LINES)
         self._said: deque[str] = deque(maxlen=_UNREAD_LINES)
         self._closed = threading.Event()
@@ -168,7 +170,11 @@ class EngineProcess:
             )
             self._said.append(f"error {self.failure.code}: {self.failure.message}")
         elif kind == "warning":
-            log.info("engine %d warns: %s %s", self.pid, event.get("code"), event.get("message"))
+            warning = {key: _text(event, key, 900) for key in ("code", "message", "advice")}
+            if len(self.warnings) < _MAX_WARNINGS and warning not in self.warnings:
+                self.warnings = [*self.warnings, warning]
+            # Its words are for the job's owner, and go when the job goes; the log stays.
+            log.info("engine %d warns: %s", self.pid, warning["code"][:80])
             self._said.append(f"warning {_text(event, 'code', 80)}: {_text(event, 'message', 900)}")
         elif kind != "done":
             self._tail.append(line.decode(errors="replace").rstrip()[:500])

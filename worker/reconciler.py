@@ -10,6 +10,7 @@ import logging
 import threading
 
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
+from service.jobs.retention import enforce
 from service.jobs.store import JobStore
 from service.queue import JobQueue
 from service.settings import Settings
@@ -33,7 +34,7 @@ class Reconciler:
 
     def tick(self) -> None:
         """One round. A step that fails is logged and tried again next time, and holds up no other."""
-        for step in (self._requeue, self._publish, self._purge, self._sweep):
+        for step in (self._requeue, self._publish, self._purge, self._sweep, self._retain):
             try:
                 step()
             except Exception:
@@ -58,3 +59,6 @@ class Reconciler:
 
     def _sweep(self) -> None:
         sweep_uploads(self._store, self._storage, self._settings.orphan_upload_seconds)
+
+    def _retain(self) -> None:
+        enforce(self._settings, self._store, self._storage)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import shutil
 import stat
+import tarfile
 from pathlib import Path
 
 from service.jobs.store import Claim
@@ -34,8 +35,8 @@ def prepare(storage: Storage, claim: Claim) -> tuple[Path, bool]:
     earlier = [path for path in run.parent.iterdir() if path != run and has_checkpoint(path)]
     if earlier:
         _take_over(max(earlier, key=_age_of_checkpoint), run, claim.token)
-    elif claim.restarted_from is not None and claim.attempt == 1:
-        _inherit(storage.attempts(claim.restarted_from), run)
+    elif not _load(storage, claim.job_id, run) and claim.restarted_from is not None and claim.attempt == 1:
+        _inherit(storage, claim.restarted_from, run)
     storage.drop_attempts(claim.job_id, keep=claim.artifact)
     return run, has_checkpoint(run)
 
@@ -65,15 +66,27 @@ def _take_over(old: Path, run: Path, token: str) -> None:
         _clear(run)
 
 
-def _inherit(attempts: list[Path], run: Path) -> None:
+def _inherit(storage: Storage, job_id: str, run: Path) -> None:
     """Copy from another job, which keeps its own."""
-    found = [path for path in attempts if has_checkpoint(path)]
+    found = [path for path in storage.attempts(job_id) if has_checkpoint(path)]
     try:
         if found:
             _copy(max(found, key=_age_of_checkpoint), run)
+        else:
+            _load(storage, job_id, run)
     except OSError as error:
         log.warning("the other job's checkpoint could not be used (%s)", error)
         _clear(run)
+
+
+def _load(storage: Storage, job_id: str, run: Path) -> bool:
+    """Take what another machine saved."""
+    try:
+        return storage.load_checkpoint(job_id, run / CHECKPOINT)
+    except (OSError, tarfile.TarError) as error:
+        log.warning("the saved checkpoint could not be fetched (%s)", error)
+        _clear(run)
+        return False
 
 
 def _clear(run: Path) -> None:

@@ -19,11 +19,12 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.jobs.housekeeping import purge_deleted
 from service.jobs.model import FINAL_STATES
 from service.jobs.store import LOST_ADVICE, Claim, Heartbeat, JobStore
+from service.logs import about
 from service.queue import JobQueue
 from service.settings import Settings
 from service.storage import Storage, missing_outputs
 from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, fit_command
-from worker.run_directory import drop_checkpoint, has_checkpoint, prepare
+from worker.run_directory import CHECKPOINT, drop_checkpoint, has_checkpoint, prepare
 from worker.sandbox import Sandbox
 
 log = logging.getLogger(__name__)
@@ -132,8 +133,12 @@ class Supervisor:
         claim = self._store.claim(job_id, lease_seconds=self._settings.lease_seconds)
         if claim is None:
             return Outcome.SKIPPED
+        with about(job_id, claim.traceparent, attempt=str(claim.attempt)):
+            return self._do(claim, Lease(self._store, claim, self._settings, since, self._clock))
+
+    def _do(self, claim: Claim, lease: Lease) -> Outcome:
+        job_id = claim.job_id
         log.info("job %s: attempt %d starts", job_id, claim.attempt)
-        lease = Lease(self._store, claim, self._settings, since, self._clock)
         try:
             outcome = self._work(claim, lease)
         except SQLAlchemyError:
@@ -164,12 +169,15 @@ class Supervisor:
                 shutil.rmtree(run, ignore_errors=True)
         elif not has_checkpoint(run):
             shutil.rmtree(run, ignore_errors=True)
+            self._storage.drop_checkpoint(claim.job_id)
+        elif outcome is not Outcome.RELEASED:
+            self._storage.save_checkpoint(claim.job_id, run / CHECKPOINT)  # for a restart
         if outcome is Outcome.CANCELLED:
             purge_deleted(self._store, self._storage)  # DELETE of a running job ends as a cancellation
 
     def _work(self, claim: Claim, lease: Lease) -> Outcome:
         run, resumed = prepare(self._storage, claim)
-        video = self._storage.source(claim.video)
+        video = self._storage.fetch_source(claim.video, run)
         try:
             command = fit_command(
                 self._settings.engine,
@@ -183,7 +191,10 @@ class Supervisor:
         except UnknownOptionError as error:
             return self._fail(claim, "options.invalid", f"The job has an {error}.", "Submit it without.")
         self._sandbox.open(run, video)
-        engine = EngineProcess(self._sandbox.command(command, run, video), self._sandbox.environment(run))
+        environment = self._sandbox.environment(run)
+        if claim.traceparent is not None:
+            environment["TRACEPARENT"] = claim.traceparent
+        engine = EngineProcess(self._sandbox.command(command, run, video), environment)
         grace = 0.0
         try:
             stop = self._watch(claim, lease, engine)
@@ -207,8 +218,11 @@ class Supervisor:
                     "Submit a shorter clip, or a lower preset.",
                 )
             case _Stop.EXITED:
+                if resumed and (code != 0 or missing_outputs(run)):
+                    # It may be the checkpoint that breaks the engine: the next attempt begins anew.
+                    drop_checkpoint(run)
                 outcome = self._conclude(claim, lease, engine, code, run)
-                if outcome is Outcome.FAILED or (outcome is Outcome.RELEASED and resumed):
+                if outcome is Outcome.FAILED:
                     drop_checkpoint(run)
                 return outcome
 
@@ -251,6 +265,8 @@ class Supervisor:
         if lines:
             try:
                 self._store.log(claim.job_id, claim.token, lines)
+                if engine.warnings:
+                    self._store.report_warnings(claim.job_id, claim.token, engine.warnings)
             except SQLAlchemyError as error:
                 log.warning("job %s: log not written (%s)", claim.job_id, type(error).__name__)
 
@@ -308,12 +324,24 @@ class Supervisor:
         return self._fail(claim, code, f"{message} It was tried {claim.attempt} times.", advice)
 
     def _release(self, claim: Claim, *, refund: bool) -> Outcome:
+        self._save(claim)
         if not self._store.release(claim.job_id, claim.token, refund=refund):
             return Outcome.LOST
         # The row is queued and due: should the broker be away, a reconciler sends the message.
         if self._queue.publish(claim.job_id, claim.queue):
             self._store.mark_published(claim.job_id)
         return Outcome.RELEASED
+
+    def _save(self, claim: Claim) -> None:
+        """Before anyone else may start: let whoever does find the checkpoint, or none."""
+        run = self._storage.artifact_path(claim.job_id, claim.artifact)
+        try:
+            if has_checkpoint(run):
+                self._storage.save_checkpoint(claim.job_id, run / CHECKPOINT)
+            else:
+                self._storage.drop_checkpoint(claim.job_id)
+        except OSError as error:
+            log.warning("job %s: its checkpoint was not saved (%s)", claim.job_id, error)
 
 
 def _describe(code: int) -> str:

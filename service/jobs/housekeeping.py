@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+from service.database import scrub
 from service.jobs.store import JobStore
 from service.storage import Storage
 from service.tus import lifecycle
@@ -26,6 +27,8 @@ def purge_deleted(store: JobStore, storage: Storage) -> list[str]:
             continue
         if store.purge(job_id):
             purged.append(job_id)
+    if purged:
+        scrub(store.engine)
     return purged
 
 

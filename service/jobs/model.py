@@ -110,6 +110,8 @@ class Job(Base):
     video: Mapped[str] = mapped_column(String(200))
     video_bytes: Mapped[int | None] = mapped_column(BigInteger, default=None)
 
+    #: What the engine found worth a word: ``code``, ``message`` and ``advice`` of each, of this attempt.
+    warnings: Mapped[list[dict[str, str]]] = mapped_column(JSON, default=list)
     error_code: Mapped[str | None] = mapped_column(String(80), default=None)
     error_message: Mapped[str | None] = mapped_column(Text, default=None)
     error_advice: Mapped[str | None] = mapped_column(Text, default=None)
@@ -133,6 +135,10 @@ class Job(Base):
     created_at: Mapped[float]
     started_at: Mapped[float | None] = mapped_column(default=None)
     finished_at: Mapped[float | None] = mapped_column(default=None)
+
+    #: When retention removed its video, and its checkpoint (service/jobs/retention.py).
+    video_dropped_at: Mapped[float | None] = mapped_column(default=None)
+    checkpoint_dropped_at: Mapped[float | None] = mapped_column(default=None)
 
     #: Outbox: when the wake-up message was last sent, how often, and when it is due again.
     last_published_at: Mapped[float | None] = mapped_column(default=None)

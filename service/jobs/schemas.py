@@ -79,6 +79,14 @@ class RestartRequest(BaseModel):
     )
 
 
+class WarningView(BaseModel):
+    """Something the engine found worth a word; the result is there all the same."""
+
+    code: str = Field(examples=["video.damaged"])
+    message: str
+    advice: str
+
+
 class Links(BaseModel):
     """Where to go from here; absent what the job's state does not allow yet."""
 
@@ -109,6 +117,7 @@ class JobView(BaseModel):
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
+    warnings: list[WarningView]
     error: ErrorView | None
     links: Links
 
@@ -162,6 +171,7 @@ def job_view(job: Job) -> JobView:
         created_at=_moment(job.created_at),
         started_at=None if job.started_at is None else _moment(job.started_at),
         finished_at=None if job.finished_at is None else _moment(job.finished_at),
+        warnings=[WarningView.model_validate(warning) for warning in job.warnings],
         error=error,
         links=Links(
             self=path,

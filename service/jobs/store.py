@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import Engine, and_, create_engine, delete, event, func, or_, select, update
+from sqlalchemy import Engine, and_, delete, func, or_, select, update
 
 from service.access import quotas
 from service.access.quotas import Quota, Usage
+from service.database import clock_of, open_database
 from service.jobs import idempotency, journal
 from service.jobs.idempotency import Reservation
-from service.jobs.model import LOCAL, Base, Job, JobState, new_job_id
+from service.jobs.model import LOCAL, Job, JobState, new_job_id
 from service.jobs.table import JobTable, held, rows, unheld
 from service.settings import Settings
 
@@ -263,6 +264,7 @@ class JobStore(JobTable):
             "stage": None,
             "fraction": 0.0,
             "message": "",
+            "warnings": [],
         }
         free = or_(Job.state == JobState.QUEUED, expired)
         taken = self._move(
@@ -328,6 +330,10 @@ class JobStore(JobTable):
                 return False
             journal.write_lines(session, job, lines, self._clock())
         return True
+
+    def report_warnings(self, job_id: str, token: str, warnings: list[dict[str, str]]) -> bool:
+        """All that the engine has warned of so far. False when fenced out."""
+        return self._update(Job.id == job_id, *held(token), warnings=warnings)
 
     def succeed(self, job_id: str, token: str, artifact: str) -> bool:
         """Publish ``artifact`` (a directory name, already on disk). False when fenced out or cancelled."""
@@ -406,6 +412,15 @@ class JobStore(JobTable):
         self._lost(Job.attempt >= limit, Job.state == JobState.RUNNING, silent)
         return [job.id for job in self._requeue(Job.state == JobState.RUNNING, silent)]
 
+    def now(self) -> float:
+        """The time that rows are stamped with, seconds since 1970."""
+        return self._clock()
+
+    def mark_dropped(self, job_id: str, *, video: bool) -> bool:
+        """The job's video (or its checkpoint) has been removed."""
+        column = "video_dropped_at" if video else "checkpoint_dropped_at"
+        return self._update(Job.id == job_id, **{column: self._clock()})
+
     def expire_upload(self, job_id: str) -> bool:
         """The awaited video did not arrive in time. False when the job no longer awaits one."""
         return bool(self._finish(JobState.EXPIRED, Job.id == job_id, *_awaiting()))
@@ -429,23 +444,10 @@ def _awaiting() -> tuple[Any, ...]:
     return (Job.state == JobState.AWAITING_UPLOAD,)
 
 
-def create_store(settings: Settings, clock: Callable[[], float] = time.time) -> JobStore:
-    """Open (and on first use create) the database of ``settings``."""
-    url = settings.database
-    if url.startswith("sqlite"):
-        settings.data_dir.mkdir(parents=True, exist_ok=True)
-        engine = create_engine(url, connect_args={"timeout": 30.0})
-        event.listen(engine, "connect", _prepare_sqlite)
-    else:
-        engine = create_engine(url, pool_pre_ping=True)
-    Base.metadata.create_all(engine)
+def create_store(settings: Settings, clock: Callable[[], float] | None = None) -> JobStore:
+    """Open (and on first use create, or migrate) the database of ``settings``. Raises DatabaseError."""
+    engine = open_database(settings)
     republish = (settings.republish_min_seconds, settings.republish_max_seconds)
-    return JobStore(engine, max_attempts=settings.max_attempts, republish=republish, clock=clock)
-
-
-def _prepare_sqlite(connection: Any, _record: Any) -> None:
-    cursor = connection.cursor()
-    # synchronous=FULL: a job answered with 202 must survive a power cut; writes are few.
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=30000"):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.close()
+    return JobStore(
+        engine, max_attempts=settings.max_attempts, republish=republish, clock=clock or clock_of(engine)
+    )

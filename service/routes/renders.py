@@ -90,7 +90,7 @@ def render_job(
     artifact = services.artifact(job_id, caller)
     most = services.settings.max_render_pixels
     view = canonical_view(pose, camera, width, height, format, most, channel)
-    part = _folder(services.storage.artifact_path(job_id, artifact), hand)
+    part = _folder(services.storage.published(job_id, artifact), hand)
     view = replace(view, hand=part.name if part.name in ("left", "right") else "")
     headers = {"ETag": view.etag(job_id, artifact), "Cache-Control": "private, no-cache"}
     if not_modified(request, headers["ETag"]):

@@ -92,6 +92,13 @@ def main() -> int:
         case "steps":
             work_in_steps(plan, run, options.resume)
             plan.pop("gate", None)
+        case "canary":
+            canary: str = plan["canary"]
+            (run / "checkpoint").mkdir(exist_ok=True)
+            (run / "checkpoint" / "state.json").write_text(json.dumps({"next": 1, "canary": canary}))
+            (run / "tracks.json").write_text(json.dumps(canary))
+            say(type="warning", code="w", message=canary, advice="")
+            say(type="progress", stage="fit", fraction=0.5, time_left=1.0, message=canary)
         case "kill":
             os.kill(os.getpid(), signal.SIGKILL)
         case "memory":

@@ -13,7 +13,7 @@ from service.access.keys import Caller
 from service.access.links import Signer, service_secret
 from service.access.quotas import Quota
 from service.jobs.idempotency import IdempotencyKeys
-from service.jobs.model import FINAL_STATES, Job, JobState, is_job_id
+from service.jobs.model import FINAL_STATES, Job, JobKind, JobState, is_job_id
 from service.jobs.store import JobStore, create_store
 from service.pictures import PictureCache
 from service.problems import Kind, ProblemError
@@ -55,6 +55,12 @@ class Services:
         if job.state in FINAL_STATES:
             raise ProblemError(Kind.JOB_NO_RESULT, f"The job is {job.state}.")
         raise ProblemError(Kind.JOB_NOT_READY, f"The job is {job.state}.", headers={"Retry-After": "5"})
+
+    def avatar(self, job_id: str, caller: Caller) -> str:
+        """:meth:`artifact` of a job that made an avatar. Raises ProblemError (404, 409)."""
+        if self.job(job_id, caller).kind != JobKind.FIT:
+            raise ProblemError(Kind.JOB_NO_RESULT, "It made a motion, not a hand; see its assets.")
+        return self.artifact(job_id, caller)
 
     def quota(self, caller: Caller) -> Quota:
         """What the caller may have."""

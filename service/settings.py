@@ -69,6 +69,8 @@ class Settings(BaseSettings):
     render_cache_bytes: int = Field(default=64 * 1024**2, ge=0)
     max_render_pixels: int = Field(default=2048 * 2048, gt=0)
 
+    max_motion_frames: int = Field(default=900, gt=0)
+
     #: The engine's command line; tests put another program here.
     engine_command: list[str] | None = None
 

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from service.jobs.model import is_job_id
+from service.jobs.model import JobKind, is_job_id
 from service.settings import Settings
 
 #: Assets that may be served, with their media types; and the pattern of preview pictures.
@@ -28,10 +28,13 @@ ASSET_TYPES: dict[str, str] = {
     "report.json": "application/json",
     "tracks.json": "application/json",
     "surfels.ply": "application/octet-stream",
+    "motion.mp4": "video/mp4",
+    "motion.webp": "image/webp",
 }
 #: A job for both hands has the files of each in a folder of its own.
 _HAND = re.compile(r"(?:left|right)/")
 _PREVIEW = re.compile(r"previews/[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(png|jpg|webp)")
+MOTIONS = ("motion.mp4", "motion.webp")
 #: Without these an attempt has not finished.
 OUTPUTS = ("avatar.safetensors", "report.json", "surfels.ply")
 #: What GET /jobs/{id}/preview shows: the result, or what the engine puts there while it works.
@@ -105,13 +108,12 @@ class Storage:
         """Forget an upload, complete or not."""
         shutil.rmtree(self._uploads / _checked(job_id), ignore_errors=True)
 
-    def share_upload(self, reference: str, job_id: str) -> str:
-        """Give a second job the video of a first one; returns the new reference.
+    def share(self, source: Path, job_id: str) -> str:
+        """Give a job a file of another one, as if it had been uploaded; returns the reference.
 
         Each has a name of its own for the same bytes: removing one leaves the other. Raises
-        FileNotFoundError when the video has been removed.
+        FileNotFoundError when the file has been removed.
         """
-        source = self.source(reference)
         part = self.begin_upload(job_id)
         try:
             os.link(source, part)
@@ -221,8 +223,10 @@ class Storage:
         return self._jobs / _checked(job_id) / artifact
 
 
-def missing_outputs(folder: Path) -> list[str]:
+def missing_outputs(folder: Path, kind: str = JobKind.FIT) -> list[str]:
     """What a finished attempt in ``folder`` lacks: its files, or those of each hand it made."""
+    if kind == JobKind.RENDER:
+        return [] if any((folder / name).is_file() for name in MOTIONS) else ["motion"]
     hands = [name for name in ("left", "right") if (folder / name).is_dir()]
     needed = [f"{hand}/{name}" for hand in hands for name in OUTPUTS] or list(OUTPUTS)
     return [name for name in (*needed, "report.json") if not (folder / name).is_file()]

@@ -80,6 +80,15 @@ def fit_command(
     return [*engine, "fit", str(video), "--out", str(run), "--json", *flags]
 
 
+def animate_command(
+    engine: Sequence[str], avatar: Path, run: Path, motion: Mapping[str, object]
+) -> list[str]:
+    """The command that renders a motion of ``avatar`` into the directory ``run``."""
+    spec = run / "motion.json"
+    spec.write_text(json.dumps(motion))
+    return [*engine, "animate", str(avatar), "--motion", str(spec), "--out", str(run), "--json"]
+
+
 def engine_environment(source: Mapping[str, str] | None = None) -> dict[str, str]:
     """The environment of the engine: the harmless part of ours, and what makes its output prompt."""
     ours = os.environ if source is None else source

@@ -17,11 +17,12 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.jobs.housekeeping import purge_deleted
+from service.jobs.model import JobKind
 from service.jobs.store import Claim, Heartbeat, JobStore
 from service.queue import JobQueue
 from service.settings import Settings
 from service.storage import Storage, missing_outputs
-from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, fit_command
+from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, animate_command, fit_command
 
 log = logging.getLogger(__name__)
 
@@ -146,7 +147,10 @@ class Supervisor:
         run = self._storage.attempt_dir(claim.job_id, claim.artifact)
         video = self._storage.source(claim.video)
         try:
-            command = fit_command(self._settings.engine, video, run, claim.options)
+            if claim.kind == JobKind.RENDER:
+                command = animate_command(self._settings.engine, video, run, claim.options)
+            else:
+                command = fit_command(self._settings.engine, video, run, claim.options)
         except UnknownOptionError as error:
             return self._fail(claim, "options.invalid", f"The job has an {error}.", "Submit it without.")
         engine = EngineProcess(command)
@@ -219,7 +223,7 @@ class Supervisor:
     def _conclude(self, claim: Claim, lease: Lease, engine: EngineProcess, code: int, run: Path) -> Outcome:
         said = engine.failure
         if code == 0:
-            missing = missing_outputs(run)
+            missing = missing_outputs(run, claim.kind)
             if not missing:
                 return self._succeed(claim, lease)
             log.error("job %s: the engine left no %s", claim.job_id, ", ".join(missing))

@@ -13,6 +13,13 @@ from sqlalchemy import JSON, Enum, Index, String, Text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 
+class JobKind(StrEnum):
+    """What a job makes: an avatar of a video, or a motion of an avatar."""
+
+    FIT = "fit"
+    RENDER = "render"
+
+
 class JobState(StrEnum):
     """Where a job stands."""
 
@@ -91,11 +98,15 @@ class Job(Base):
         Index("ix_jobs_state_lease", "state", "lease_until"),
         Index("ix_jobs_state_publish", "state", "publish_due_at"),
         Index("ix_jobs_owner", "owner", "id"),
+        Index("ix_jobs_parent", "parent"),
     )
 
     id: Mapped[str] = mapped_column(String(36), primary_key=True)
     #: Whose job it is: the name of an API key's owner, or :data:`LOCAL` where the service is open.
     owner: Mapped[str] = mapped_column(String(64), default=LOCAL)
+    kind: Mapped[str] = mapped_column(String(20), default=JobKind.FIT)
+    #: Of a render: the job whose avatar moves.
+    parent: Mapped[str | None] = mapped_column(String(36), default=None)
     state: Mapped[JobState] = mapped_column(_STATE, default=JobState.QUEUED)
     #: What the engine does now and how far the whole job is (0 to 1, never falling within one attempt).
     stage: Mapped[str | None] = mapped_column(String(40), default=None)
@@ -104,7 +115,8 @@ class Job(Base):
     message: Mapped[str] = mapped_column(Text, default="")
 
     options: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
-    #: The uploaded video, relative to the data directory; no name chosen by a client appears in it.
+    #: The uploaded video (of a render: the avatar), relative to the data directory; no name chosen by a
+    #: client appears in it.
     video: Mapped[str] = mapped_column(String(200))
     video_bytes: Mapped[int | None] = mapped_column(default=None)
 

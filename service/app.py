@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from importlib.metadata import version
 from typing import Any
 
@@ -20,10 +21,12 @@ from service.guard import Guard
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
 from service.problems import Kind, ProblemBody, declared
 from service.rendering import Loader, load_avatar
-from service.routes import assets, jobs, links, page, progress, renders, submission, system, uploads
-from service.services import open_services
+from service.routes import assets, jobs, links, page, progress, renders, submission, system, uploads, webhooks
+from service.services import Services, open_services
 from service.settings import Settings
+from service.webhooks.sender import Sender
 
+_WEBHOOK_GRACE = 3.0
 #: What every route but the public ones may answer.
 ACCESS = (Kind.ACCESS_KEY, Kind.ACCESS_SCOPE, Kind.ACCESS_LINK)
 
@@ -41,7 +44,8 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
             await run_in_threadpool(
                 sweep_uploads, services.store, services.storage, settings.orphan_upload_seconds
             )
-            yield
+            with _webhooks(services):
+                yield
 
     app = FastAPI(
         title="MASS",
@@ -63,6 +67,7 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
         assets.router,
         links.router,
         uploads.router,
+        webhooks.router,
         system.router,
     ):
         app.include_router(router, responses=everywhere)
@@ -72,6 +77,20 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
     app.add_middleware(Guard, hosts=frozenset({settings.host, *settings.allowed_hosts}))
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     return app
+
+
+@contextmanager
+def _webhooks(services: Services) -> Iterator[None]:
+    """Messages are sent by a thread of each API process; which one sends a message is left to chance."""
+    stopping = threading.Event()
+    sender = Sender(services.outbox, private=services.settings.webhook_private)
+    thread = threading.Thread(target=sender.run, args=(stopping,), name="webhooks", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        thread.join(_WEBHOOK_GRACE)
 
 
 def _operation_id(route: APIRoute) -> str:

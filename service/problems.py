@@ -249,6 +249,14 @@ class Kind(Enum):
         "Ask for bytes within the size the asset list gives.",
     )
 
+    WEBHOOK_NOT_FOUND = ("webhook.not_found", 404, "There is no such webhook", "GET /webhooks lists yours.")
+    WEBHOOK_URL = (
+        "webhook.url",
+        422,
+        "Nothing can be sent to this address",
+        "Use an https address that everybody can reach.",
+    )
+
     POSE_INVALID = (
         "pose.invalid",
         422,

@@ -23,6 +23,7 @@ from service.settings import Settings
 from service.storage import Storage, create_storage
 from service.tus.rows import UploadStore, create_uploads
 from service.watching import StreamSlots
+from service.webhooks.outbox import Outbox
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Services:
     pictures: PictureCache
     signer: Signer
     streams: StreamSlots
+    outbox: Outbox
 
     def job(self, job_id: str, caller: Caller) -> Job:
         """The job, if the caller may see it. Raises ProblemError (404): others' jobs do not exist."""
@@ -82,21 +84,19 @@ def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
         pool = create_pool(settings, loader)
         stack.callback(pool.close)
         pool.start()
-        pictures = PictureCache(settings.render_cache_bytes)
         signer = Signer(service_secret(settings.secret.get_secret_value(), settings.data_dir))
-        keys = IdempotencyKeys(store.engine)
-        uploads = create_uploads(settings, store.engine)
         yield Services(
-            settings,
-            store,
-            keys,
-            uploads,
-            storage,
-            queue,
-            pool,
-            pictures,
-            signer,
-            StreamSlots(settings.max_streams),
+            settings=settings,
+            store=store,
+            keys=IdempotencyKeys(store.engine),
+            uploads=create_uploads(settings, store.engine),
+            storage=storage,
+            queue=queue,
+            pool=pool,
+            pictures=PictureCache(settings.render_cache_bytes),
+            signer=signer,
+            streams=StreamSlots(settings.max_streams),
+            outbox=Outbox(store.engine),
         )
 
 

@@ -48,6 +48,9 @@ class Settings(BaseSettings):
     #: An upload without a job that nobody wrote to for this long is removed.
     orphan_upload_seconds: float = Field(default=3600.0, gt=0)
 
+    #: Let webhooks go to http and private addresses: for receivers beside the service.
+    webhook_private: bool = False
+
     lease_seconds: float = Field(default=60.0, gt=0)
     heartbeat_seconds: float = Field(default=10.0, gt=0)
     max_attempts: int = Field(default=3, ge=1)

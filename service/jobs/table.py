@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from service.jobs import journal
 from service.jobs.model import FINAL_STATES, HELD_STATES, Job, JobState, sources
+from service.webhooks import outbox
 
 #: Progress is entered in the journal when it has grown by this much.
 _PROGRESS_STEP = 0.005
@@ -35,6 +36,7 @@ class JobTable:
         session.add(job)
         session.flush()
         journal.record(session, job, "state", job.created_at)
+        outbox.enqueue(session, job, job.created_at)
 
     def _move(self, target: JobState, *where: ColumnElement[bool], **values: Any) -> list[Job]:
         """The only statement that writes a state: it leaves none but those the table allows.
@@ -51,7 +53,9 @@ class JobTable:
         with self._session.begin() as session:
             moved = [*session.scalars(statement)]
             for job in moved:
-                journal.record(session, job, "state", self._clock())
+                now = self._clock()
+                journal.record(session, job, "state", now)
+                outbox.enqueue(session, job, now)
         return moved
 
     def _finish(self, target: JobState, *where: ColumnElement[bool], **values: Any) -> list[Job]:

@@ -19,6 +19,7 @@ from service.access.gate import Gate, asks_for_keys, is_public
 from service.access.keys import KeyStore
 from service.guard import Guard
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
+from service.observing import Observer
 from service.problems import Kind, ProblemBody, declared
 from service.rendering import Loader, load_avatar
 from service.routes import assets, jobs, links, page, progress, renders, submission, system, uploads, webhooks
@@ -75,6 +76,7 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
     app.mount("/web", StaticFiles(directory=page.WEB), name="web")
     app.add_middleware(Gate, keyed=asks_for_keys(settings.auth, settings.host))
     app.add_middleware(Guard, hosts=frozenset({settings.host, *settings.allowed_hosts}))
+    app.add_middleware(Observer)
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     return app
 

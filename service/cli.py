@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import os
 import socket
 import sys
@@ -18,6 +17,7 @@ from typing import Any
 
 from service.client import DEFAULT_URL, AssetInfo, JobInfo, MassClient, ServiceError
 from service.keys_command import add_parser as add_keys_parser
+from service.logs import configure as configure_logs
 from service.progress import FollowBar, transfer_bar
 
 _FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
@@ -52,11 +52,10 @@ def _serve(options: argparse.Namespace) -> int:
     from service.embedded import BrokerError
     from service.serve import ServeError, serve
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s serve %(levelname)s %(message)s")
-    logging.getLogger("httpx").setLevel(logging.WARNING)
     settings = _settings(options)
     if settings is None:
         return 2
+    configure_logs("serve", settings.log_format)
     try:
         return serve(settings, options.workers)
     except (ServeError, BrokerError) as error:
@@ -68,15 +67,16 @@ def _api(options: argparse.Namespace) -> int:
 
     from service.app import create_app
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s api[%(process)d] %(levelname)s %(message)s")
     settings = _settings(options)
     if settings is None:
         return 2
+    configure_logs("api", settings.log_format)
     # Open event streams and downloads may not hold up a stop for longer than this.
     config = uvicorn.Config(
         create_app(settings),
         host=settings.host,
         port=settings.port,
+        log_config=None,
         log_level="warning",
         access_log=False,
         server_header=False,

@@ -84,6 +84,13 @@ class Kind(Enum):
         "Try again; if it stays, report it with the time of the request.",
     )
 
+    NOT_READY = (
+        "service.not_ready",
+        503,
+        "The service cannot do all of its work",
+        "See `errors` for the parts in trouble; jobs that were accepted are safe.",
+    )
+
     UPLOAD_INCOMPLETE = (
         "upload.incomplete",
         400,

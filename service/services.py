@@ -15,6 +15,7 @@ from service.access.quotas import Quota
 from service.jobs.idempotency import IdempotencyKeys
 from service.jobs.model import FINAL_STATES, Job, JobKind, JobState, is_job_id
 from service.jobs.store import JobStore, create_store
+from service.metrics import Metrics
 from service.pictures import PictureCache
 from service.problems import Kind, ProblemError
 from service.queue import JobQueue, create_queue
@@ -41,6 +42,7 @@ class Services:
     signer: Signer
     streams: StreamSlots
     outbox: Outbox
+    metrics: Metrics
 
     def job(self, job_id: str, caller: Caller) -> Job:
         """The job, if the caller may see it. Raises ProblemError (404): others' jobs do not exist."""
@@ -97,6 +99,7 @@ def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
             signer=signer,
             streams=StreamSlots(settings.max_streams),
             outbox=Outbox(store.engine),
+            metrics=Metrics(store),
         )
 
 

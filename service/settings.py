@@ -51,6 +51,8 @@ class Settings(BaseSettings):
     #: Let webhooks go to http and private addresses: for receivers beside the service.
     webhook_private: bool = False
 
+    log_format: Literal["text", "json"] = "text"
+
     lease_seconds: float = Field(default=60.0, gt=0)
     heartbeat_seconds: float = Field(default=10.0, gt=0)
     max_attempts: int = Field(default=3, ge=1)

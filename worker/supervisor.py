@@ -19,6 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.jobs.housekeeping import purge_deleted
 from service.jobs.model import JobKind
 from service.jobs.store import Claim, Heartbeat, JobStore
+from service.logs import about, trace_of
 from service.queue import JobQueue
 from service.settings import Settings
 from service.storage import Storage, missing_outputs
@@ -123,6 +124,11 @@ class Supervisor:
         claim = self._store.claim(job_id, lease_seconds=self._settings.lease_seconds)
         if claim is None:
             return Outcome.SKIPPED
+        with about(job=job_id, trace=trace_of(claim.traceparent)):
+            return self._run(claim, since)
+
+    def _run(self, claim: Claim, since: float) -> Outcome:
+        job_id = claim.job_id
         log.info("job %s: attempt %d starts", job_id, claim.attempt)
         lease = Lease(self._store, claim, self._settings, since, self._clock)
         try:

@@ -110,6 +110,7 @@ class Job(Base):
     state: Mapped[JobState] = mapped_column(_STATE, default=JobState.QUEUED)
     #: What the engine does now and how far the whole job is (0 to 1, never falling within one attempt).
     stage: Mapped[str | None] = mapped_column(String(40), default=None)
+    stage_since: Mapped[float | None] = mapped_column(default=None)
     fraction: Mapped[float] = mapped_column(default=0.0)
     time_left: Mapped[float | None] = mapped_column(default=None)
     message: Mapped[str] = mapped_column(Text, default="")

@@ -271,6 +271,7 @@ class JobStore(JobTable):
             "attempt": Job.attempt + 1,
             "started_at": func.coalesce(Job.started_at, now),
             "stage": None,
+            "stage_since": None,
             "fraction": 0.0,
             "message": "",
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,11 +14,11 @@ from service.access.gate import CallerDep
 from service.jobs.model import JobKind
 from service.jobs.schemas import JobPage, JobView, MotionRequest, job_view
 from service.motions import canonical_motion
-from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, canonical_view
+from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, View, canonical_view
 from service.problems import Kind, ProblemError, declared
 from service.routes.jobs import Cursor, JobId, checked_cursor
 from service.routes.submission import ACCEPTED, IDEMPOTENCY, IdempotencyKey
-from service.services import ServicesDep, not_modified
+from service.services import Services, ServicesDep, not_modified
 from service.submission import Wanted, fingerprint, spelled, submit
 
 router = APIRouter(prefix="/jobs", tags=["results"])
@@ -102,8 +103,10 @@ def render_job(
     if not_modified(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     picture = services.pictures.get(job_id, artifact, view)
-    if picture is None:
-        picture = services.pool.render(part / "avatar.safetensors", view)
+    if picture is not None:
+        services.metrics.renders.labels("cached").inc()
+    else:
+        picture = _draw(services, part / "avatar.safetensors", view)
         services.pictures.put(job_id, artifact, view, picture)
     return Response(picture, media_type=view.media_type, headers=headers)
 
@@ -168,6 +171,18 @@ def list_renders(
     services.job(job_id, caller)
     jobs, following = services.store.page(limit, checked_cursor(cursor), caller.sees, parent=job_id)
     return JobPage(jobs=[job_view(job) for job in jobs], next=following)
+
+
+def _draw(services: Services, avatar: Path, view: View) -> bytes:
+    start = time.perf_counter()
+    try:
+        picture = services.pool.render(avatar, view)
+    except ProblemError as error:
+        services.metrics.renders.labels(error.kind.code).inc()
+        raise
+    services.metrics.renders.labels("drawn").inc()
+    services.metrics.render_seconds.observe(time.perf_counter() - start)
+    return picture
 
 
 def _folder(result: Path, hand: str | None) -> Path:

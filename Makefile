@@ -36,7 +36,7 @@ bench: setup
 	$(BIN)/mass-engine bench render
 
 openapi: setup
-	$(BIN)/python -m service.openapi > openapi/openapi.json
+	$(BIN)/python -m service.openapi $(if $(BREAK),--break)
 
 clean:
 	rm -rf build dist demo-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -20,7 +20,12 @@ MEDIA_TYPE = "application/problem+json"
 class Kind(Enum):
     """Every error the service answers with: code, status, title, advice. The codes are part of the API."""
 
-    REQUEST_MALFORMED = ("request.malformed", 400, "The request cannot be read", "Check the form encoding.")
+    REQUEST_MALFORMED = (
+        "request.malformed",
+        400,
+        "The request cannot be read",
+        "Check how the body is encoded.",
+    )
     REQUEST_HOST = (
         "request.host",
         403,
@@ -69,6 +74,12 @@ class Kind(Enum):
         415,
         "The body is not a form",
         "Send multipart/form-data with the video in the field `video`.",
+    )
+    REQUEST_TOO_LARGE = (
+        "request.too_large",
+        413,
+        "The body is too long",
+        "Send less; only videos may be long, see POST /jobs and POST /uploads.",
     )
     REQUEST_INVALID = (
         "request.invalid",
@@ -410,10 +421,25 @@ def declared(*kinds: Kind) -> dict[int | str, dict[str, Any]]:
     return {
         status: {
             "description": "; ".join(f"`{kind.code}`: {kind.title}" for kind in group),
-            "content": {MEDIA_TYPE: {"schema": schema}},
+            "content": {
+                MEDIA_TYPE: {"schema": schema, "examples": {kind.code: _example(kind) for kind in group}}
+            },
         }
         for status, group in sorted(by_status.items())
     }
+
+
+def _example(kind: Kind) -> dict[str, Any]:
+    body = ProblemBody(
+        type=f"/problems/{kind.code}",
+        title=kind.title,
+        status=kind.status,
+        detail=f"{kind.title}.",
+        instance="/the/path",
+        code=kind.code,
+        advice=kind.advice,
+    )
+    return {"summary": kind.title, "value": body.model_dump()}
 
 
 def field_errors(errors: Any) -> list[dict[str, str]]:
@@ -438,7 +464,13 @@ async def _on_problem(request: Request, error: Exception) -> ProblemResponse:
 
 async def _on_http(request: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, HTTPException)
-    kinds = {404: Kind.NOT_FOUND, 405: Kind.METHOD, 413: Kind.UPLOAD_TOO_LARGE, 500: Kind.INTERNAL}
+    kinds = {
+        400: Kind.REQUEST_MALFORMED,
+        404: Kind.NOT_FOUND,
+        405: Kind.METHOD,
+        413: Kind.UPLOAD_TOO_LARGE,
+        500: Kind.INTERNAL,
+    }
     kind = kinds.get(error.status_code, Kind.HTTP)
     headers = dict(error.headers or {})
     detail = "" if error.status_code in kinds else str(error.detail)

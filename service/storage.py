@@ -42,6 +42,8 @@ _LATEST = ("previews/pose-rest.png", "previews/live.jpg")
 _MAX_PREVIEW = 4 * 1024**2
 _PREVIEW_TYPES = {"png": "image/png", "jpg": "image/jpeg", "webp": "image/webp"}
 _ARTIFACT = re.compile(r"[0-9]{1,6}-[0-9a-zA-Z]{1,64}")
+#: Every media type an asset can have.
+MEDIA_TYPES = frozenset({*ASSET_TYPES.values(), *_PREVIEW_TYPES.values()})
 _MANIFEST = "assets.json"
 
 

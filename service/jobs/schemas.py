@@ -9,6 +9,46 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.jobs.model import FINAL_STATES, Job, JobKind, JobState
 
+_ID = "01a20643-3392-721a-b36b-68b7197560f0"
+_EXAMPLE = {
+    "id": _ID,
+    "kind": "fit",
+    "parent": None,
+    "state": "running",
+    "stage": "fit",
+    "fraction": 0.41,
+    "time_left": 95.0,
+    "message": "stage 2 at 640 px",
+    "attempt": 1,
+    "options": {
+        "side": "auto",
+        "preset": "auto",
+        "seed": 0,
+        "fov": None,
+        "max_frames": None,
+        "holdout": None,
+    },
+    "motion": None,
+    "restarted_from": None,
+    "video_bytes": 7340032,
+    "created_at": "2026-11-23T10:00:00Z",
+    "started_at": "2026-11-23T10:00:01Z",
+    "finished_at": None,
+    "error": None,
+    "links": {
+        "self": f"/jobs/{_ID}",
+        "cancel": f"/jobs/{_ID}/cancel",
+        "upload": None,
+        "restart": None,
+        "events": f"/jobs/{_ID}/events",
+        "logs": f"/jobs/{_ID}/logs",
+        "preview": f"/jobs/{_ID}/preview",
+        "render": None,
+        "renders": None,
+        "assets": None,
+    },
+}
+
 
 class JobOptions(BaseModel):
     """How to reconstruct; the names and meanings are those of the engine's command line."""
@@ -118,6 +158,8 @@ class Links(BaseModel):
 
 class JobView(BaseModel):
     """One job."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
 
     id: str
     kind: JobKind = Field(description="`fit`: an avatar of a video; `render`: a motion of an avatar.")

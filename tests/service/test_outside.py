@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from pydantic import SecretStr
 
 from service.access.keys import KeyStore, Scope
 from service.embedded import EmbeddedBroker
@@ -143,7 +144,9 @@ def test_log_lines_are_json_and_say_the_job_and_the_trace(live: Live, lines: io.
 
 
 def test_no_secret_gets_into_a_log(tmp_path: Path, lines: io.StringIO) -> None:
-    settings = Settings(data_dir=tmp_path, auth="keys", min_free_bytes=0, secret="canary-of-the-service")
+    settings = Settings(
+        data_dir=tmp_path, auth="keys", min_free_bytes=0, secret=SecretStr("canary-of-the-service")
+    )
     with serve(settings) as live:
         key = KeyStore(live.services.store.engine).create("ann", [Scope.WRITE])
         live.http.headers["Authorization"] = f"Bearer {key}"

@@ -54,4 +54,6 @@ class BodyLimit:
 
 def _is_video(scope: Scope) -> bool:
     method, path = scope["method"], scope["path"]
-    return (method == "POST" and path == "/jobs") or (method == "PATCH" and path.startswith("/uploads/"))
+    return bool(
+        (method == "POST" and path == "/jobs") or (method == "PATCH" and path.startswith("/uploads/"))
+    )

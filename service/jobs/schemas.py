@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.jobs.model import FINAL_STATES, Job, JobKind, JobState
 
 _ID = "01a20643-3392-721a-b36b-68b7197560f0"
-_EXAMPLE = {
+_EXAMPLE: dict[str, Any] = {
     "id": _ID,
     "kind": "fit",
     "parent": None,

@@ -35,7 +35,7 @@ bench: setup
 	$(BIN)/mass-engine bench raster
 	$(BIN)/mass-engine bench render
 
-openapi: setup
+openapi: setup  # BREAK=1 for a change that breaks clients
 	$(BIN)/python -m service.openapi $(if $(BREAK),--break)
 
 clean:

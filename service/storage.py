@@ -126,6 +126,19 @@ class Storage:
             shutil.copyfile(source, part)
         return self.finish_upload(job_id)
 
+    def share_checkpoint(self, job_id: str, new_id: str) -> bool:
+        """Give a job the latest checkpoint another one left, where its first attempt looks for one.
+
+        The engine keeps it in ``checkpoint`` of an attempt's directory. False when there is none.
+        """
+        folders = [path for path in (self._jobs / _checked(job_id)).glob("*/checkpoint") if path.is_dir()]
+        if not folders:
+            return False
+        latest = max(folders, key=lambda path: path.stat().st_mtime)
+        target = self.attempt_dir(new_id, "0-restart") / "checkpoint"
+        shutil.copytree(latest, target, symlinks=True, ignore=_only_plain)
+        return True
+
     def source(self, reference: str) -> Path:
         """The video a row refers to (``Job.video``)."""
         path = self.root / reference
@@ -232,6 +245,12 @@ def missing_outputs(folder: Path, kind: str = JobKind.FIT) -> list[str]:
     hands = [name for name in ("left", "right") if (folder / name).is_dir()]
     needed = [f"{hand}/{name}" for hand in hands for name in OUTPUTS] or list(OUTPUTS)
     return [name for name in (*needed, "report.json") if not (folder / name).is_file()]
+
+
+def _only_plain(folder: str, names: list[str]) -> list[str]:
+    """Names to leave out of a copy: an engine's output is not trusted, so links and the like stay behind."""
+    modes = {name: os.lstat(os.path.join(folder, name)).st_mode for name in names}
+    return [name for name, mode in modes.items() if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))]
 
 
 def create_storage(settings: Settings) -> Storage:

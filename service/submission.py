@@ -74,6 +74,7 @@ async def submit(
         if made is None:
             # Not awaited in a thread: a cancelled request may await nothing more.
             services.storage.discard_upload(job_id)
+            services.storage.drop_attempts(job_id)
             if isinstance(reservation, Reservation):
                 services.keys.release(reservation)
     if made is not None:

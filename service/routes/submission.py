@@ -198,5 +198,7 @@ def _again(services: Services, caller: Caller, job_id: str, new_id: str, wish: R
         video = services.storage.share(services.storage.source(job.video), new_id)
     except FileNotFoundError:
         raise ProblemError(Kind.JOB_NO_VIDEO) from None
+    if wish.from_stage is not None:
+        services.storage.share_checkpoint(job_id, new_id)
     mark = fingerprint(f"POST /jobs/{job_id}/restart", wish.from_stage or "", spelled(options))
     return Wanted(new_id, options, video, job.video_bytes, mark, job_id, wish.from_stage)

@@ -18,6 +18,7 @@ from service.compatibility import breaking_changes
 from service.openapi import document
 from service.pictures import Channel
 from service.problems import Kind, ProblemBody
+from service.reference import DOCUMENT, updated
 from tests.service.conftest import VIDEO, Live, problem
 
 ROOT = Path(__file__).parents[2]
@@ -105,7 +106,8 @@ def test_capabilities_name_the_limits(live: Live) -> None:
 
 
 def test_the_page_offers_every_channel(live: Live) -> None:
-    assert re.findall(r'<option value="(\w+)"', live.http.get("/").text) == list(get_args(Channel))
+    selector = live.http.get("/").text.partition('id="channel"')[2].partition("</select>")[0]
+    assert re.findall(r'<option value="(\w+)"', selector) == list(get_args(Channel))
 
 
 @pytest.mark.parametrize(
@@ -226,3 +228,23 @@ def test_additions_break_nothing() -> None:
     assert breaking_changes(committed, more) == []
     option = changed(committed, "components>schemas>JobOptions>properties>mood", {"type": "string"})
     assert breaking_changes(committed, option) == []
+
+
+def test_the_documents_tables_are_not_stale() -> None:
+    text = DOCUMENT.read_text()
+    assert updated(text) == text, "run: python -m service.reference"
+    for name in ("queued", "awaiting_upload", "worker.lost", "engine.timeout"):
+        assert f"`{name}`" in text
+    for path in json.loads(document())["paths"]:
+        root = "/" + path.split("/")[1]
+        assert root in text
+
+
+def test_every_failure_of_a_video_is_in_the_document() -> None:
+    """The engine's codes are found where it raises them, so that a new one cannot be forgotten."""
+    written = DOCUMENT.read_text()
+    codes = set()
+    for path in (ROOT / "mass_engine").rglob("*.py"):
+        codes |= set(re.findall(r'"(video\.[a-z_]+)"', path.read_text()))
+    for code in codes - {"video.not_found", "video.one_hand"}:  # the command line's; a warning
+        assert f"`{code}`" in written, code

@@ -121,7 +121,7 @@ def _document(app: FastAPI) -> dict[str, Any]:
         for items in document["paths"].values():
             for operation in items.values():
                 if "requestBody" in operation:
-                    bodies = declared(Kind.REQUEST_MALFORMED, Kind.REQUEST_TOO_LARGE)
+                    bodies = declared(Kind.REQUEST_MALFORMED, Kind.UPLOAD_STALLED, Kind.REQUEST_TOO_LARGE)
                     declares = operation["responses"]
                     declares |= {str(s): a for s, a in bodies.items() if str(s) not in declares}
         scheme = {"type": "http", "scheme": "bearer", "description": "A key of `mass keys create`."}

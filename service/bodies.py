@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import anyio
 from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -9,6 +10,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.problems import Kind, ProblemError, ProblemResponse
 
 MAX_BODY = 512 * 1024
+#: Such a body is here in this time, or its sender is playing for time.
+SECONDS = 30.0
 
 
 class BodyLimit:
@@ -26,19 +29,16 @@ class BodyLimit:
         declared = headers.get("content-length", "0")
         body = b""
         if not declared.isdecimal() or int(declared[:12]) > MAX_BODY:
-            await self._refuse(scope, receive, send)
+            await _answer(_too_long(), scope, receive, send)
             return
         if declared != "0" or "transfer-encoding" in headers:
-            while True:
-                message = await receive()
-                if message["type"] != "http.request":
-                    return  # the client has gone
-                body += message.get("body", b"")
-                if len(body) > MAX_BODY:
-                    await self._refuse(scope, receive, send)
-                    return
-                if not message.get("more_body"):
-                    break
+            received = await self._read(receive)
+            if received is None:
+                return
+            if isinstance(received, ProblemError):
+                await _answer(received, scope, receive, send)
+                return
+            body = received
         whole: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
         async def replay() -> Message:
@@ -46,10 +46,29 @@ class BodyLimit:
 
         await self._app(scope, replay, send)
 
-    async def _refuse(self, scope: Scope, receive: Receive, send: Send) -> None:
-        problem = ProblemError(Kind.REQUEST_TOO_LARGE, f"A body may have {MAX_BODY} bytes here.")
-        problem.unread = True
-        await ProblemResponse(Request(scope), problem)(scope, receive, send)
+    async def _read(self, receive: Receive) -> bytes | ProblemError | None:
+        """The whole body; what is wrong with it; or None when the client has gone."""
+        body: bytes = b""
+        with anyio.move_on_after(SECONDS):
+            while True:
+                message = await receive()
+                if message["type"] != "http.request":
+                    return None
+                body += message.get("body", b"")
+                if len(body) > MAX_BODY:
+                    return _too_long()
+                if not message.get("more_body"):
+                    return body
+        return ProblemError(Kind.UPLOAD_STALLED)
+
+
+def _too_long() -> ProblemError:
+    return ProblemError(Kind.REQUEST_TOO_LARGE, f"A body may have {MAX_BODY} bytes here.")
+
+
+async def _answer(problem: ProblemError, scope: Scope, receive: Receive, send: Send) -> None:
+    problem.unread = True
+    await ProblemResponse(Request(scope), problem)(scope, receive, send)
 
 
 def _is_video(scope: Scope) -> bool:

@@ -111,8 +111,8 @@ class Kind(Enum):
     UPLOAD_STALLED = (
         "upload.stalled",
         408,
-        "The upload stopped sending",
-        "Send the file again over a better connection.",
+        "The request stopped in the middle",
+        "Send it again over a better connection.",
     )
     UPLOAD_TOO_LARGE = (
         "upload.too_large",

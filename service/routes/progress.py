@@ -106,11 +106,11 @@ async def watch_job(
         after = max(after, int(last_event_id))
     if job.state in FINAL_STATES and after >= job.event_seq:
         return Response(status_code=204)
-    if not services.streams.room(caller.owner):
+    if not services.streams.room(job.owner):
         raise ProblemError(Kind.STREAMS, headers={"Retry-After": "30"})
 
     async def stream() -> AsyncIterator[bytes]:
-        with services.streams.held(caller.owner):
+        with services.streams.held(job.owner):
             async for event in follow(services.store, job_id, after):
                 yield event
 

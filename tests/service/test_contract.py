@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any, get_args
 import pytest
 from openapi_spec_validator import validate
 
+from service import bodies
 from service.bodies import MAX_BODY
 from service.compatibility import breaking_changes
 from service.openapi import document
@@ -168,13 +170,19 @@ def test_async_routes_await_and_do_not_block() -> None:
     assert found
 
 
-def test_a_long_body_is_refused_before_it_is_parsed(live: Live) -> None:
+def test_a_long_or_slow_body_is_refused_before_it_is_parsed(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, long = "/webhooks", b"[" * (MAX_BODY + 1)
     headers = {"Content-Type": "application/json"}
     problem(live.http.post(path, content=long, headers=headers), 413, "request.too_large")
     problem(live.http.post(path, content=iter([long]), headers=headers), 413, "request.too_large")
     fits = b" " * (MAX_BODY - 2) + b"[]"
     problem(live.http.post(path, content=iter([fits]), headers=headers), 422, "request.invalid")
+    monkeypatch.setattr(bodies, "SECONDS", 0.2)
+    with socket.create_connection((live.host, live.port), timeout=30) as slow:
+        slow.sendall(b"POST /webhooks HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n{")
+        assert slow.recv(1000).startswith(b"HTTP/1.1 408")
     problem(live.http.post(path, content=b"[" * 100_000, headers=headers), 400, "request.malformed")
 
 

@@ -101,6 +101,20 @@ def build_parser() -> argparse.ArgumentParser:
     )
     render.set_defaults(run=_render)
 
+    animate = commands.add_parser("animate", help="a moving hand: poses in turn, or a turn around one")
+    animate.add_argument("run_dir", type=Path, metavar="RUN")
+    animate.add_argument(
+        "--motion",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help='JSON: kind ("poses", "turntable"), poses, between, loop, seconds, camera, width, height, fps, '
+        'format ("mp4", "webp"); every one may be left out',
+    )
+    animate.add_argument("--out", type=Path, required=True, help="directory for motion.mp4 or motion.webp")
+    animate.add_argument("--json", action="store_true", help="progress as JSON lines on standard output")
+    animate.set_defaults(run=_animate)
+
     export = commands.add_parser("export", help="write the avatar's surfels for other tools")
     export.add_argument("run_dir", type=Path, metavar="RUN")
     export.add_argument("--format", choices=("ply", "ply3d"), required=True)
@@ -225,6 +239,20 @@ def _render(arguments: argparse.Namespace) -> None:
             arguments.channel,
         )
         print(f"wrote {arguments.out}")
+
+
+def _animate(arguments: argparse.Namespace) -> None:
+    from mass_engine.motion import animate, read_motion
+
+    def report(fraction: float) -> None:
+        if arguments.json:
+            _emit(type="progress", stage="render", fraction=round(fraction, 4), time_left=None, message="")
+
+    file = animate(arguments.run_dir, read_motion(arguments.motion), arguments.out, report)
+    if arguments.json:
+        _emit(type="done", report=str(file))
+    else:
+        print(f"wrote {file}")
 
 
 def _export(arguments: argparse.Namespace) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from importlib.metadata import version
 from typing import Any
 
@@ -16,14 +17,20 @@ from fastapi.staticfiles import StaticFiles
 from service import problems
 from service.access.gate import Gate, asks_for_keys, is_public
 from service.access.keys import KeyStore
+from service.bodies import BodyLimit
 from service.guard import Guard
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
+from service.jobs.schemas import UploadedJob
+from service.observing import Observer
 from service.problems import Kind, ProblemBody, declared
 from service.rendering import Loader, load_avatar
-from service.routes import assets, jobs, links, page, progress, renders, submission, system, uploads
-from service.services import open_services
+from service.routes import assets, jobs, links, page, progress, renders, submission, system, uploads, webhooks
+from service.routes.progress import JobEventData
+from service.services import Services, open_services
 from service.settings import Settings
+from service.webhooks.sender import Sender
 
+_WEBHOOK_GRACE = 3.0
 #: What every route but the public ones may answer.
 ACCESS = (Kind.ACCESS_KEY, Kind.ACCESS_SCOPE, Kind.ACCESS_LINK)
 
@@ -41,7 +48,8 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
             await run_in_threadpool(
                 sweep_uploads, services.store, services.storage, settings.orphan_upload_seconds
             )
-            yield
+            with _webhooks(services):
+                yield
 
     app = FastAPI(
         title="MASS",
@@ -63,15 +71,32 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
         assets.router,
         links.router,
         uploads.router,
+        webhooks.router,
         system.router,
     ):
         app.include_router(router, responses=everywhere)
     app.include_router(page.router)
     app.mount("/web", StaticFiles(directory=page.WEB), name="web")
+    app.add_middleware(BodyLimit)
     app.add_middleware(Gate, keyed=asks_for_keys(settings.auth, settings.host))
     app.add_middleware(Guard, hosts=frozenset({settings.host, *settings.allowed_hosts}))
+    app.add_middleware(Observer)
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     return app
+
+
+@contextmanager
+def _webhooks(services: Services) -> Iterator[None]:
+    """Messages are sent by a thread of each API process; which one sends a message is left to chance."""
+    stopping = threading.Event()
+    sender = Sender(services.outbox, private=services.settings.webhook_private)
+    thread = threading.Thread(target=sender.run, args=(stopping,), name="webhooks", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        thread.join(_WEBHOOK_GRACE)
 
 
 def _operation_id(route: APIRoute) -> str:
@@ -90,8 +115,15 @@ def _document(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         schemas = document["components"]["schemas"]
-        body = ProblemBody.model_json_schema(ref_template="#/components/schemas/{model}")
-        schemas.update(body.pop("$defs"), ProblemBody=body)
+        for model in (ProblemBody, UploadedJob, JobEventData):  # none of them is a route's declared type
+            body = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas.update(body.pop("$defs", {}), **{model.__name__: body})
+        for items in document["paths"].values():
+            for operation in items.values():
+                if "requestBody" in operation:
+                    bodies = declared(Kind.REQUEST_MALFORMED, Kind.UPLOAD_STALLED, Kind.REQUEST_TOO_LARGE)
+                    declares = operation["responses"]
+                    declares |= {str(s): a for s, a in bodies.items() if str(s) not in declares}
         scheme = {"type": "http", "scheme": "bearer", "description": "A key of `mass keys create`."}
         document["components"]["securitySchemes"] = {"key": scheme}
         for path, operation in (

@@ -23,10 +23,12 @@ HEAD = "0001"
 #: The modules that define tables.
 _TABLES = (
     "service.access.keys",
+    "service.jobs.figures",
     "service.jobs.idempotency",
     "service.jobs.journal",
     "service.jobs.model",
     "service.tus.rows",
+    "service.webhooks.outbox",
 )
 _MIGRATIONS = Path(__file__).parent / "migrations"
 #: Any number will do, so long as everyone uses the same.

@@ -1,74 +1,89 @@
-"""Log lines that say which job and which trace they belong to, as text for people or JSON for machines."""
+"""Log lines that say which job and trace they belong to: as text, or as JSON for a machine."""
 
 from __future__ import annotations
 
 import json
 import logging
-import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Literal, TextIO
 
-#: What the current thread works on; set by :func:`about`, and empty everywhere else.
-_SUBJECT: ContextVar[dict[str, str]] = ContextVar("subject", default={})  # noqa: B039 (never changed, only replaced)
-_TRACEPARENT = re.compile(r"00-([0-9a-f]{32})-([0-9a-f]{16})-[0-9a-f]{2}")
+LogFormat = Literal["text", "json"]
+
+#: What the current request or job is about; set by :func:`about`.
+_ABOUT: ContextVar[dict[str, str] | None] = ContextVar("about", default=None)
+#: Attributes of a record that are put into JSON when somebody passes them as ``extra``.
+_EXTRA = ("method", "path", "status", "milliseconds")
 
 
 @contextmanager
-def about(job_id: str, traceparent: str | None = None, **more: str) -> Iterator[None]:
-    """Everything logged inside is about this job, and part of this W3C trace."""
-    subject = {"job": job_id, **more}
-    match = _TRACEPARENT.fullmatch(traceparent or "")
-    if match is not None:
-        subject |= {"trace_id": match.group(1), "parent_span_id": match.group(2)}
-    token = _SUBJECT.set(subject)
+def about(**names: str | None) -> Iterator[None]:
+    """Say in every line logged inside what it is about: ``job``, ``trace``."""
+    token = _ABOUT.set({**(_ABOUT.get() or {}), **{k: v for k, v in names.items() if v is not None}})
     try:
         yield
     finally:
-        _SUBJECT.reset(token)
+        _ABOUT.reset(token)
+
+
+def trace_of(traceparent: str | None) -> str | None:
+    """The trace id in a W3C trace context; None when it is none."""
+    parts = (traceparent or "").split("-")
+    return parts[1] if len(parts) == 4 and len(parts[1]) == 32 else None
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: time, level, logger, message, and what it is about."""
+    """One JSON object a line."""
 
-    def __init__(self, process: str) -> None:
+    def __init__(self, part: str) -> None:
         super().__init__()
-        self._process = process
+        self._part = part
 
     def format(self, record: logging.LogRecord) -> str:
-        """See logging.Formatter."""
-        line = {
-            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
-            "level": record.levelname.lower(),
-            "process": self._process,
-            "pid": record.process,
+        """The line."""
+        said: dict[str, object] = {
+            "at": datetime.fromtimestamp(record.created, UTC).isoformat(),
+            "level": record.levelname,
+            "part": self._part,
             "logger": record.name,
             "message": record.getMessage(),
-            **_SUBJECT.get(),
+            **getattr(record, "about", {}),
+            **{name: getattr(record, name) for name in _EXTRA if hasattr(record, name)},
         }
         if record.exc_info:
-            line["error"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False)
+            said["exception"] = self.formatException(record.exc_info)
+        return json.dumps(said, ensure_ascii=False, default=str)
 
 
 class TextFormatter(logging.Formatter):
-    """A line for people; the trace follows in brackets where there is one."""
+    """For people: time, part, level, message, and at the end what it is about."""
 
-    def __init__(self, process: str) -> None:
-        super().__init__(f"%(asctime)s {process}[%(process)d] %(levelname)s %(message)s")
+    def __init__(self, part: str) -> None:
+        super().__init__(f"%(asctime)s {part}[%(process)d] %(levelname)s %(message)s")
 
-    def format(self, record: logging.LogRecord) -> str:
-        """See logging.Formatter."""
-        trace = _SUBJECT.get().get("trace_id")
-        text = super().format(record)
-        return f"{text} [trace {trace}]" if trace else text
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the base class's name
+        """The line without its exception."""
+        names: dict[str, str] = getattr(record, "about", {})
+        unsaid = [f"{name}={value}" for name, value in names.items() if value not in record.message]
+        return " ".join([super().formatMessage(record), *unsaid])
 
 
-def configure(process: str, kind: Literal["text", "json"]) -> None:
-    """Send the log of this process to standard error. To be called once, by the program's main."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter(process) if kind == "json" else TextFormatter(process))
-    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+def configure(part: str, style: LogFormat, stream: TextIO | None = None) -> logging.Handler:
+    """Send all lines of this process to ``stream`` (standard error); returns the handler in charge."""
+    handler = logging.StreamHandler(stream or sys.stderr)
+    handler.setFormatter(JsonFormatter(part) if style == "json" else TextFormatter(part))
+    handler.addFilter(_add_about)
+    root = logging.getLogger()
+    root.handlers[:] = [handler]
+    root.setLevel(logging.INFO)
+    for name in ("httpx", "httpcore"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    return handler
+
+
+def _add_about(record: logging.LogRecord) -> bool:
+    record.about = _ABOUT.get() or {}
+    return True

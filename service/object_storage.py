@@ -10,6 +10,7 @@ copies of jobs that are gone.
 from __future__ import annotations
 
 import logging
+import shutil
 import tarfile
 import tempfile
 import time
@@ -52,16 +53,29 @@ class ObjectStorage(Storage):
         except BlobError as error:
             log.warning("upload %s: not yet removed from the store (%s)", job_id, error)
 
-    def share_upload(self, reference: str, job_id: str) -> str:
-        """Give a second job a copy of the video."""
-        self.source(reference)  # checks the reference
+    def share(self, source: Path, job_id: str) -> str:
+        """Give a job a file of another one, wherever that is."""
         part = self.begin_upload(job_id)
         try:
-            self._blobs.get(reference, part)
+            if source.is_file():
+                shutil.copyfile(source, part)
+            else:
+                self._blobs.get(source.relative_to(self.root).as_posix(), part)
         except BlobMissingError as error:
             super().discard_upload(job_id)
-            raise FileNotFoundError(reference) from error
+            raise FileNotFoundError(str(source)) from error
         return self.finish_upload(job_id)
+
+    def share_checkpoint(self, job_id: str, new_id: str) -> bool:
+        """Give a job the latest checkpoint another one left, where every worker finds it."""
+        with tempfile.TemporaryDirectory(prefix=".pack-", dir=self.root / "jobs") as scratch:
+            packed = Path(scratch) / _CHECKPOINT
+            try:
+                self._blobs.get(f"jobs/{job_id}/{_CHECKPOINT}.d/{_CHECKPOINT}", packed)
+            except BlobMissingError:
+                return False
+            self._blobs.put(f"jobs/{new_id}/{_CHECKPOINT}.d/{_CHECKPOINT}", packed)
+        return True
 
     def fetch_source(self, reference: str, run: Path) -> Path:
         """A copy in the attempt's scratch folder, which no other attempt touches."""

@@ -20,7 +20,12 @@ MEDIA_TYPE = "application/problem+json"
 class Kind(Enum):
     """Every error the service answers with: code, status, title, advice. The codes are part of the API."""
 
-    REQUEST_MALFORMED = ("request.malformed", 400, "The request cannot be read", "Check the form encoding.")
+    REQUEST_MALFORMED = (
+        "request.malformed",
+        400,
+        "The request cannot be read",
+        "Check how the body is encoded.",
+    )
     REQUEST_HOST = (
         "request.host",
         403,
@@ -70,6 +75,12 @@ class Kind(Enum):
         "The body is not a form",
         "Send multipart/form-data with the video in the field `video`.",
     )
+    REQUEST_TOO_LARGE = (
+        "request.too_large",
+        413,
+        "The body is too long",
+        "Send less; only videos may be long, see POST /jobs and POST /uploads.",
+    )
     REQUEST_INVALID = (
         "request.invalid",
         422,
@@ -84,6 +95,13 @@ class Kind(Enum):
         "Try again; if it stays, report it with the time of the request.",
     )
 
+    NOT_READY = (
+        "service.not_ready",
+        503,
+        "The service cannot do all of its work",
+        "See `errors` for the parts in trouble; jobs that were accepted are safe.",
+    )
+
     UPLOAD_INCOMPLETE = (
         "upload.incomplete",
         400,
@@ -93,8 +111,8 @@ class Kind(Enum):
     UPLOAD_STALLED = (
         "upload.stalled",
         408,
-        "The upload stopped sending",
-        "Send the file again over a better connection.",
+        "The request stopped in the middle",
+        "Send it again over a better connection.",
     )
     UPLOAD_TOO_LARGE = (
         "upload.too_large",
@@ -249,6 +267,14 @@ class Kind(Enum):
         "Ask for bytes within the size the asset list gives.",
     )
 
+    WEBHOOK_NOT_FOUND = ("webhook.not_found", 404, "There is no such webhook", "GET /webhooks lists yours.")
+    WEBHOOK_URL = (
+        "webhook.url",
+        422,
+        "Nothing can be sent to this address",
+        "Use an https address that everybody can reach.",
+    )
+
     POSE_INVALID = (
         "pose.invalid",
         422,
@@ -395,10 +421,25 @@ def declared(*kinds: Kind) -> dict[int | str, dict[str, Any]]:
     return {
         status: {
             "description": "; ".join(f"`{kind.code}`: {kind.title}" for kind in group),
-            "content": {MEDIA_TYPE: {"schema": schema}},
+            "content": {
+                MEDIA_TYPE: {"schema": schema, "examples": {kind.code: _example(kind) for kind in group}}
+            },
         }
         for status, group in sorted(by_status.items())
     }
+
+
+def _example(kind: Kind) -> dict[str, Any]:
+    body = ProblemBody(
+        type=f"/problems/{kind.code}",
+        title=kind.title,
+        status=kind.status,
+        detail=f"{kind.title}.",
+        instance="/the/path",
+        code=kind.code,
+        advice=kind.advice,
+    )
+    return {"summary": kind.title, "value": body.model_dump()}
 
 
 def field_errors(errors: Any) -> list[dict[str, str]]:
@@ -423,7 +464,13 @@ async def _on_problem(request: Request, error: Exception) -> ProblemResponse:
 
 async def _on_http(request: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, HTTPException)
-    kinds = {404: Kind.NOT_FOUND, 405: Kind.METHOD, 413: Kind.UPLOAD_TOO_LARGE, 500: Kind.INTERNAL}
+    kinds = {
+        400: Kind.REQUEST_MALFORMED,
+        404: Kind.NOT_FOUND,
+        405: Kind.METHOD,
+        413: Kind.UPLOAD_TOO_LARGE,
+        500: Kind.INTERNAL,
+    }
     kind = kinds.get(error.status_code, Kind.HTTP)
     headers = dict(error.headers or {})
     detail = "" if error.status_code in kinds else str(error.detail)

@@ -13,8 +13,9 @@ from service.access.keys import Caller
 from service.access.links import Signer, service_secret
 from service.access.quotas import Quota
 from service.jobs.idempotency import IdempotencyKeys
-from service.jobs.model import FINAL_STATES, Job, JobState, is_job_id
+from service.jobs.model import FINAL_STATES, Job, JobKind, JobState, is_job_id
 from service.jobs.store import JobStore, create_store
+from service.metrics import Metrics
 from service.pictures import PictureCache
 from service.problems import Kind, ProblemError
 from service.queue import JobQueue, create_queue
@@ -23,6 +24,7 @@ from service.settings import Settings
 from service.storage import Storage, create_storage
 from service.tus.rows import UploadStore, create_uploads
 from service.watching import StreamSlots
+from service.webhooks.outbox import Outbox
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class Services:
     pictures: PictureCache
     signer: Signer
     streams: StreamSlots
+    outbox: Outbox
+    metrics: Metrics
 
     def job(self, job_id: str, caller: Caller) -> Job:
         """The job, if the caller may see it. Raises ProblemError (404): others' jobs do not exist."""
@@ -55,6 +59,12 @@ class Services:
         if job.state in FINAL_STATES:
             raise ProblemError(Kind.JOB_NO_RESULT, f"The job is {job.state}.")
         raise ProblemError(Kind.JOB_NOT_READY, f"The job is {job.state}.", headers={"Retry-After": "5"})
+
+    def avatar(self, job_id: str, caller: Caller) -> str:
+        """:meth:`artifact` of a job that made an avatar. Raises ProblemError (404, 409)."""
+        if self.job(job_id, caller).kind != JobKind.FIT:
+            raise ProblemError(Kind.JOB_NO_RESULT, "It made a motion, not a hand; see its assets.")
+        return self.artifact(job_id, caller)
 
     def quota(self, caller: Caller) -> Quota:
         """What the caller may have."""
@@ -76,21 +86,20 @@ def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
         pool = create_pool(settings, loader)
         stack.callback(pool.close)
         pool.start()
-        pictures = PictureCache(settings.render_cache_bytes)
         signer = Signer(service_secret(settings.secret.get_secret_value(), settings.data_dir))
-        keys = IdempotencyKeys(store.engine)
-        uploads = create_uploads(settings, store.engine)
         yield Services(
-            settings,
-            store,
-            keys,
-            uploads,
-            storage,
-            queue,
-            pool,
-            pictures,
-            signer,
-            StreamSlots(settings.max_streams),
+            settings=settings,
+            store=store,
+            keys=IdempotencyKeys(store.engine),
+            uploads=create_uploads(settings, store.engine),
+            storage=storage,
+            queue=queue,
+            pool=pool,
+            pictures=PictureCache(settings.render_cache_bytes),
+            signer=signer,
+            streams=StreamSlots(settings.max_streams),
+            outbox=Outbox(store.engine),
+            metrics=Metrics(store),
         )
 
 

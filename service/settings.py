@@ -63,6 +63,8 @@ class Settings(BaseSettings):
     keep_video_seconds: float = Field(default=30 * 86400.0, ge=0)
     keep_checkpoint_seconds: float = Field(default=86400.0, ge=0)
     keep_job_seconds: float = Field(default=0.0, ge=0)
+    #: Let webhooks go to http and private addresses: for receivers beside the service.
+    webhook_private: bool = False
 
     lease_seconds: float = Field(default=60.0, gt=0)
     heartbeat_seconds: float = Field(default=10.0, gt=0)
@@ -84,6 +86,8 @@ class Settings(BaseSettings):
     render_warm_avatars: int = Field(default=4, ge=1)
     render_cache_bytes: int = Field(default=64 * 1024**2, ge=0)
     max_render_pixels: int = Field(default=2048 * 2048, gt=0)
+
+    max_motion_frames: int = Field(default=900, gt=0)
 
     #: The engine's command line; tests put another program here.
     engine_command: list[str] | None = None

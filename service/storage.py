@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from service.jobs.model import is_job_id
+from service.jobs.model import JobKind, is_job_id
 from service.settings import Settings
 
 #: Assets that may be served, with their media types; and the pattern of preview pictures.
@@ -30,10 +30,13 @@ ASSET_TYPES: dict[str, str] = {
     "report.json": "application/json",
     "tracks.json": "application/json",
     "surfels.ply": "application/octet-stream",
+    "motion.mp4": "video/mp4",
+    "motion.webp": "image/webp",
 }
 #: A job for both hands has the files of each in a folder of its own.
 _HAND = re.compile(r"(?:left|right)/")
 _PREVIEW = re.compile(r"previews/[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(png|jpg|webp)")
+MOTIONS = ("motion.mp4", "motion.webp")
 #: Without these an attempt has not finished.
 OUTPUTS = ("avatar.safetensors", "report.json", "surfels.ply")
 #: What GET /jobs/{id}/preview shows: the result, or what the engine puts there while it works.
@@ -43,6 +46,8 @@ _PREVIEW_TYPES = {"png": "image/png", "jpg": "image/jpeg", "webp": "image/webp"}
 _ARTIFACT = re.compile(r"[0-9]{1,6}-[0-9a-zA-Z]{1,64}")
 #: The list of a result's assets, written last.
 MANIFEST = "assets.json"
+#: Every media type an asset can have.
+MEDIA_TYPES = frozenset({*ASSET_TYPES.values(), *_PREVIEW_TYPES.values()})
 
 
 @dataclass(frozen=True)
@@ -109,13 +114,12 @@ class Storage:
         """Forget an upload, complete or not."""
         shutil.rmtree(self._uploads / _checked(job_id), ignore_errors=True)
 
-    def share_upload(self, reference: str, job_id: str) -> str:
-        """Give a second job the video of a first one; returns the new reference.
+    def share(self, source: Path, job_id: str) -> str:
+        """Give a job a file of another one, as if it had been uploaded; returns the reference.
 
         Each has a name of its own for the same bytes: removing one leaves the other. Raises
-        FileNotFoundError when the video has been removed.
+        FileNotFoundError when the file has been removed.
         """
-        source = self.source(reference)
         part = self.begin_upload(job_id)
         try:
             os.link(source, part)
@@ -125,6 +129,19 @@ class Storage:
         except OSError:  # a file system without links
             shutil.copyfile(source, part)
         return self.finish_upload(job_id)
+
+    def share_checkpoint(self, job_id: str, new_id: str) -> bool:
+        """Give a job the latest checkpoint another one left, where its first attempt looks for one.
+
+        The engine keeps it in ``checkpoint`` of an attempt's directory. False when there is none.
+        """
+        folders = [path for path in (self._jobs / _checked(job_id)).glob("*/checkpoint") if path.is_dir()]
+        if not folders:
+            return False
+        latest = max(folders, key=lambda path: path.stat().st_mtime)
+        target = self.attempt_dir(new_id, "0-restart") / "checkpoint"
+        shutil.copytree(latest, target, symlinks=True, ignore=_only_plain)
+        return True
 
     def source(self, reference: str) -> Path:
         """The video a row refers to (``Job.video``)."""
@@ -265,11 +282,19 @@ class Storage:
         return self._jobs / _checked(job_id) / artifact
 
 
-def missing_outputs(folder: Path) -> list[str]:
+def missing_outputs(folder: Path, kind: str = JobKind.FIT) -> list[str]:
     """What a finished attempt in ``folder`` lacks: its files, or those of each hand it made."""
+    if kind == JobKind.RENDER:
+        return [] if any((folder / name).is_file() for name in MOTIONS) else ["motion"]
     hands = [name for name in ("left", "right") if (folder / name).is_dir()]
     needed = [f"{hand}/{name}" for hand in hands for name in OUTPUTS] or list(OUTPUTS)
     return [name for name in (*needed, "report.json") if not (folder / name).is_file()]
+
+
+def _only_plain(folder: str, names: list[str]) -> list[str]:
+    """Names to leave out of a copy: an engine's output is not trusted, so links and the like stay behind."""
+    modes = {name: os.lstat(os.path.join(folder, name)).st_mode for name in names}
+    return [name for name, mode in modes.items() if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))]
 
 
 def create_storage(settings: Settings) -> Storage:

@@ -18,8 +18,8 @@ from sqlalchemy.exc import IntegrityError
 from service.access.keys import Caller
 from service.access.quotas import QuotaError
 from service.jobs.idempotency import Made, Reservation, ReservationLostError, parse_key
-from service.jobs.model import Job, is_job_id, new_job_id
-from service.jobs.schemas import JobOptions
+from service.jobs.model import Job, JobKind, is_job_id, new_job_id
+from service.jobs.schemas import JobOptions, MotionRequest
 from service.problems import Kind, ProblemError, field_errors
 from service.queue import queue_for
 from service.services import Services
@@ -34,12 +34,14 @@ class Wanted:
     """A job about to be inserted; its video is on disk under the id ``job_id``."""
 
     job_id: str
-    options: JobOptions
+    options: JobOptions | MotionRequest
     video: str
     video_bytes: int | None
     fingerprint: str
     restarted_from: str | None = None
     from_stage: str | None = None
+    kind: JobKind = JobKind.FIT
+    parent: str | None = None
 
 
 _TRACEPARENT = re.compile(r"00-(?!0{32})[0-9a-f]{32}-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
@@ -73,6 +75,7 @@ async def submit(
         if made is None:
             # Not awaited in a thread: a cancelled request may await nothing more.
             services.storage.discard_upload(job_id)
+            services.storage.drop_attempts(job_id)
             if isinstance(reservation, Reservation):
                 services.keys.release(reservation)
     if made is not None:
@@ -176,7 +179,7 @@ def traceparent(header: str) -> str:
     return f"00-{os.urandom(16).hex()}-{os.urandom(8).hex()}-00"
 
 
-def spelled(options: JobOptions) -> str:
+def spelled(options: JobOptions | MotionRequest) -> str:
     """The options as one canonical text."""
     return json.dumps(options.model_dump(exclude_none=True), sort_keys=True)
 
@@ -224,6 +227,8 @@ def _insert(
             quota=services.quota(caller),
             awaits_upload=awaits_upload,
             video_bytes=wanted.video_bytes,
+            kind=wanted.kind,
+            parent=wanted.parent,
             restarted_from=wanted.restarted_from,
             from_stage=wanted.from_stage,
             traceparent=traceparent(request.headers.get("traceparent", "")),

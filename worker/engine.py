@@ -88,6 +88,15 @@ def fit_command(
     return [*engine, "fit", str(video), "--out", str(run), "--json", *flags]
 
 
+def animate_command(
+    engine: Sequence[str], avatar: Path, run: Path, motion: Mapping[str, object]
+) -> list[str]:
+    """The command that renders a motion of ``avatar`` into the directory ``run``."""
+    spec = run / "motion.json"
+    spec.write_text(json.dumps(motion))
+    return [*engine, "animate", str(avatar), "--motion", str(spec), "--out", str(run), "--json"]
+
+
 class EngineProcess:
     """One run. Start it from the thread that stays until it ends; always call :meth:`stop` at the end."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 
-from service.jobs.housekeeping import purge_deleted, sweep_uploads
+from service.jobs.housekeeping import purge_deleted, sweep_records, sweep_uploads
 from service.jobs.retention import enforce
 from service.jobs.store import JobStore
 from service.queue import JobQueue
@@ -59,6 +59,7 @@ class Reconciler:
 
     def _sweep(self) -> None:
         sweep_uploads(self._store, self._storage, self._settings.orphan_upload_seconds)
+        sweep_records(self._store)
 
     def _retain(self) -> None:
         enforce(self._settings, self._store, self._storage)

@@ -28,15 +28,15 @@ _RESULTS = frozenset({"avatar.safetensors", "report.json", "surfels.ply", "surfe
 def prepare(storage: Storage, claim: Claim) -> tuple[Path, bool]:
     """Make the attempt's directory; returns it and whether there is a checkpoint in it to go on from.
 
-    Everything left by earlier attempts is gone afterwards. The first attempt of a restarted job goes on from
-    what the job before left. Raises OSError when the directory cannot be made.
+    Everything left by earlier attempts is gone afterwards. The first attempt of a restarted job finds what
+    was shared with it as if an attempt had left it. Raises OSError when the directory cannot be made.
     """
     run = storage.attempt_dir(claim.job_id, claim.artifact)
     earlier = [path for path in run.parent.iterdir() if path != run and has_checkpoint(path)]
     if earlier:
         _take_over(max(earlier, key=_age_of_checkpoint), run, claim.token)
-    elif not _load(storage, claim.job_id, run) and claim.restarted_from is not None and claim.attempt == 1:
-        _inherit(storage, claim.restarted_from, run)
+    else:
+        _load(storage, claim.job_id, run)
     storage.drop_attempts(claim.job_id, keep=claim.artifact)
     return run, has_checkpoint(run)
 
@@ -63,19 +63,6 @@ def _take_over(old: Path, run: Path, token: str) -> None:
         _copy(aside, run)
     except OSError as error:
         log.warning("the checkpoint could not be taken over (%s); starting from the beginning", error)
-        _clear(run)
-
-
-def _inherit(storage: Storage, job_id: str, run: Path) -> None:
-    """Copy from another job, which keeps its own."""
-    found = [path for path in storage.attempts(job_id) if has_checkpoint(path)]
-    try:
-        if found:
-            _copy(max(found, key=_age_of_checkpoint), run)
-        else:
-            _load(storage, job_id, run)
-    except OSError as error:
-        log.warning("the other job's checkpoint could not be used (%s)", error)
         _clear(run)
 
 

@@ -17,13 +17,13 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.jobs.housekeeping import purge_deleted
-from service.jobs.model import FINAL_STATES
+from service.jobs.model import FINAL_STATES, JobKind
 from service.jobs.store import LOST_ADVICE, Claim, Heartbeat, JobStore
-from service.logs import about
+from service.logs import about, trace_of
 from service.queue import JobQueue
 from service.settings import Settings
 from service.storage import Storage, missing_outputs
-from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, fit_command
+from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, animate_command, fit_command
 from worker.run_directory import CHECKPOINT, drop_checkpoint, has_checkpoint, prepare
 from worker.sandbox import Sandbox
 
@@ -133,7 +133,7 @@ class Supervisor:
         claim = self._store.claim(job_id, lease_seconds=self._settings.lease_seconds)
         if claim is None:
             return Outcome.SKIPPED
-        with about(job_id, claim.traceparent, attempt=str(claim.attempt)):
+        with about(job=job_id, trace=trace_of(claim.traceparent)):
             return self._do(claim, Lease(self._store, claim, self._settings, since, self._clock))
 
     def _do(self, claim: Claim, lease: Lease) -> Outcome:
@@ -179,15 +179,18 @@ class Supervisor:
         run, resumed = prepare(self._storage, claim)
         video = self._storage.fetch_source(claim.video, run)
         try:
-            command = fit_command(
-                self._settings.engine,
-                video,
-                run,
-                claim.options,
-                resume=resumed,
-                from_stage=claim.from_stage,
-                max_seconds=self._settings.max_video_seconds,
-            )
+            if claim.kind == JobKind.RENDER:
+                command = animate_command(self._settings.engine, video, run, claim.options)
+            else:
+                command = fit_command(
+                    self._settings.engine,
+                    video,
+                    run,
+                    claim.options,
+                    resume=resumed,
+                    from_stage=claim.from_stage,
+                    max_seconds=self._settings.max_video_seconds,
+                )
         except UnknownOptionError as error:
             return self._fail(claim, "options.invalid", f"The job has an {error}.", "Submit it without.")
         self._sandbox.open(run, video)
@@ -218,7 +221,7 @@ class Supervisor:
                     "Submit a shorter clip, or a lower preset.",
                 )
             case _Stop.EXITED:
-                if resumed and (code != 0 or missing_outputs(run)):
+                if resumed and (code != 0 or missing_outputs(run, claim.kind)):
                     # It may be the checkpoint that breaks the engine: the next attempt begins anew.
                     drop_checkpoint(run)
                 outcome = self._conclude(claim, lease, engine, code, run)
@@ -273,7 +276,7 @@ class Supervisor:
     def _conclude(self, claim: Claim, lease: Lease, engine: EngineProcess, code: int, run: Path) -> Outcome:
         said = engine.failure
         if code == 0:
-            missing = missing_outputs(run)
+            missing = missing_outputs(run, claim.kind)
             if not missing:
                 return self._succeed(claim, lease)
             log.error("job %s: the engine left no %s", claim.job_id, ", ".join(missing))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 
 from service.database import scrub
+from service.jobs.idempotency import IdempotencyKeys
 from service.jobs.store import JobStore
 from service.storage import Storage
 from service.tus import lifecycle
 from service.tus.rows import UploadStore
+from service.webhooks.outbox import Outbox
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +32,12 @@ def purge_deleted(store: JobStore, storage: Storage) -> list[str]:
     if purged:
         scrub(store.engine)
     return purged
+
+
+def sweep_records(store: JobStore) -> None:
+    """Forget idempotency keys that have expired and webhook messages that were finished long ago."""
+    IdempotencyKeys(store.engine).sweep()
+    Outbox(store.engine).sweep()
 
 
 def sweep_uploads(store: JobStore, storage: Storage, older_than: float) -> list[str]:

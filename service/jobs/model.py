@@ -13,6 +13,13 @@ from sqlalchemy import JSON, BigInteger, Enum, Index, String, Text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 
+class JobKind(StrEnum):
+    """What a job makes: an avatar of a video, or a motion of an avatar."""
+
+    FIT = "fit"
+    RENDER = "render"
+
+
 class JobState(StrEnum):
     """Where a job stands."""
 
@@ -91,14 +98,19 @@ class Job(Base):
         Index("ix_jobs_state_lease", "state", "lease_until"),
         Index("ix_jobs_state_publish", "state", "publish_due_at"),
         Index("ix_jobs_owner", "owner", "id"),
+        Index("ix_jobs_parent", "parent"),
     )
 
     id: Mapped[str] = mapped_column(String(36), primary_key=True)
     #: Whose job it is: the name of an API key's owner, or :data:`LOCAL` where the service is open.
     owner: Mapped[str] = mapped_column(String(64), default=LOCAL)
+    kind: Mapped[str] = mapped_column(String(20), default=JobKind.FIT)
+    #: Of a render: the job whose avatar moves.
+    parent: Mapped[str | None] = mapped_column(String(36), default=None)
     state: Mapped[JobState] = mapped_column(_STATE, default=JobState.QUEUED)
     #: What the engine does now and how far the whole job is (0 to 1, never falling within one attempt).
     stage: Mapped[str | None] = mapped_column(String(40), default=None)
+    stage_since: Mapped[float | None] = mapped_column(default=None)
     fraction: Mapped[float] = mapped_column(default=0.0)
     time_left: Mapped[float | None] = mapped_column(default=None)
     message: Mapped[str] = mapped_column(Text, default="")
@@ -106,7 +118,8 @@ class Job(Base):
     options: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
     #: Which workers may take it: ``cpu`` or ``gpu``.
     queue: Mapped[str] = mapped_column(String(20), default="cpu", server_default="cpu")
-    #: The uploaded video, relative to the data directory; no name chosen by a client appears in it.
+    #: The uploaded video (of a render: the avatar), relative to the data directory; no name chosen by a
+    #: client appears in it.
     video: Mapped[str] = mapped_column(String(200))
     video_bytes: Mapped[int | None] = mapped_column(BigInteger, default=None)
 

@@ -3,11 +3,51 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.jobs.model import FINAL_STATES, Job, JobState
+from service.jobs.model import FINAL_STATES, Job, JobKind, JobState
+
+_ID = "01a20643-3392-721a-b36b-68b7197560f0"
+_EXAMPLE: dict[str, Any] = {
+    "id": _ID,
+    "kind": "fit",
+    "parent": None,
+    "state": "running",
+    "stage": "fit",
+    "fraction": 0.41,
+    "time_left": 95.0,
+    "message": "stage 2 at 640 px",
+    "attempt": 1,
+    "options": {
+        "side": "auto",
+        "preset": "auto",
+        "seed": 0,
+        "fov": None,
+        "max_frames": None,
+        "holdout": None,
+    },
+    "motion": None,
+    "restarted_from": None,
+    "video_bytes": 7340032,
+    "created_at": "2026-11-23T10:00:00Z",
+    "started_at": "2026-11-23T10:00:01Z",
+    "finished_at": None,
+    "error": None,
+    "links": {
+        "self": f"/jobs/{_ID}",
+        "cancel": f"/jobs/{_ID}/cancel",
+        "upload": None,
+        "restart": None,
+        "events": f"/jobs/{_ID}/events",
+        "logs": f"/jobs/{_ID}/logs",
+        "preview": f"/jobs/{_ID}/preview",
+        "render": None,
+        "renders": None,
+        "assets": None,
+    },
+}
 
 
 class JobOptions(BaseModel):
@@ -42,6 +82,31 @@ class JobOptions(BaseModel):
         le=1000,
         description="Keep every n-th frame out of the fit and measure quality on it.",
     )
+
+
+class MotionRequest(BaseModel):
+    """A moving hand."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    kind: Literal["turntable", "poses"] = Field(
+        default="turntable", description="Once around the first pose, or from each pose to the next."
+    )
+    poses: list[Annotated[str, Field(max_length=2000)]] = Field(
+        default=["rest"],
+        min_length=1,
+        max_length=200,
+        description="Poses as `render` takes them.",
+        examples=[["rest", "fist", "spread"]],
+    )
+    between: int = Field(default=11, ge=0, le=120, description="Pictures put between two poses.")
+    loop: bool = Field(default=True, description="Back to the first pose at the end.")
+    seconds: float = Field(default=4.0, gt=0, le=30, allow_inf_nan=False, description="Of a turntable.")
+    camera: str = Field(default="orbit:0,0", max_length=200, description="As `render` takes it.")
+    width: int = Field(default=512, ge=16, le=2048)
+    height: int = Field(default=512, ge=16, le=2048)
+    fps: float = Field(default=30.0, ge=1, le=60, allow_inf_nan=False)
+    format: Literal["mp4", "webp"] = Field(default="mp4", description="mp4 on white, webp with alpha.")
 
 
 class UploadedJob(BaseModel):
@@ -98,20 +163,26 @@ class Links(BaseModel):
     logs: str
     preview: str
     render: str | None = None
+    renders: str | None = None
     assets: str | None = None
 
 
 class JobView(BaseModel):
     """One job."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
+
     id: str
+    kind: JobKind = Field(description="`fit`: an avatar of a video; `render`: a motion of an avatar.")
+    parent: str | None = Field(description="Of a render: the job whose avatar moves.")
     state: JobState
     stage: str | None = Field(description="What the engine does now: read, track, segment, align, ...")
     fraction: float = Field(ge=0, le=1, description="Of the whole job; never falls within one attempt.")
     time_left: float | None = Field(description="Seconds, as the engine estimates it.")
     message: str
     attempt: int = Field(description="Which try this is; a try lost to a crash is repeated.")
-    options: JobOptions
+    options: JobOptions | None = Field(description="Of a fit.")
+    motion: MotionRequest | None = Field(description="Of a render.")
     restarted_from: str | None = Field(description="The job whose video this one uses again.")
     video_bytes: int | None
     created_at: datetime
@@ -149,6 +220,7 @@ def job_view(job: Job) -> JobView:
     """The public side of a row."""
     path = f"/jobs/{job.id}"
     done = job.state == JobState.SUCCEEDED
+    fits = job.kind == JobKind.FIT
     error = None
     if job.error_code is not None:
         error = ErrorView(
@@ -159,13 +231,16 @@ def job_view(job: Job) -> JobView:
         )
     return JobView(
         id=job.id,
+        kind=JobKind(job.kind),
+        parent=job.parent,
         state=job.state,
         stage=job.stage,
         fraction=job.fraction,
         time_left=job.time_left,
         message=job.message,
         attempt=job.attempt,
-        options=JobOptions.model_validate(job.options),
+        options=JobOptions.model_validate(job.options) if fits else None,
+        motion=None if fits else MotionRequest.model_validate(job.options),
         restarted_from=job.restarted_from,
         video_bytes=job.video_bytes,
         created_at=_moment(job.created_at),
@@ -177,11 +252,12 @@ def job_view(job: Job) -> JobView:
             self=path,
             upload=f"/uploads/{job.id}" if job.state == JobState.AWAITING_UPLOAD else None,
             cancel=None if job.state in FINAL_STATES else f"{path}/cancel",
-            restart=f"{path}/restart" if job.state in FINAL_STATES - {JobState.EXPIRED} else None,
+            restart=f"{path}/restart" if fits and job.state in FINAL_STATES - {JobState.EXPIRED} else None,
             events=f"{path}/events",
             logs=f"{path}/logs",
             preview=f"{path}/preview",
-            render=f"{path}/render" if done else None,
+            render=f"{path}/render" if done and fits else None,
+            renders=f"{path}/renders" if done and fits else None,
             assets=f"{path}/assets" if done else None,
         ),
     )

@@ -16,11 +16,12 @@ from service.access.quotas import Quota, Usage
 from service.database import clock_of, open_database
 from service.jobs import idempotency, journal
 from service.jobs.idempotency import Reservation
-from service.jobs.model import LOCAL, Job, JobState, new_job_id
+from service.jobs.model import LOCAL, Job, JobKind, JobState, new_job_id
 from service.jobs.table import JobTable, held, rows, unheld
 from service.settings import Settings
 
 LOST_ADVICE = "Submit the video again; if it fails the same way, try a shorter or smaller clip."
+_ALL = 1_000_000
 #: The reconciler leaves a new row this long to whoever created it.
 _PUBLISH_GRACE = 2.0
 
@@ -41,6 +42,7 @@ class Claim:
     from_stage: str | None = None
     traceparent: str | None = None
     queue: str = "cpu"
+    kind: str = JobKind.FIT
 
     @property
     def artifact(self) -> str:
@@ -100,6 +102,8 @@ class JobStore(JobTable):
         video_bytes: int | None = None,
         queue: str = "cpu",
         owner: str = LOCAL,
+        kind: JobKind = JobKind.FIT,
+        parent: str | None = None,
         awaits_upload: bool = False,
         restarted_from: str | None = None,
         from_stage: str | None = None,
@@ -117,6 +121,8 @@ class JobStore(JobTable):
         job = Job(
             id=job_id or new_job_id(now),
             owner=owner,
+            kind=kind,
+            parent=parent,
             state=JobState.AWAITING_UPLOAD if awaits_upload else JobState.QUEUED,
             options=dict(options),
             queue=queue,
@@ -159,9 +165,14 @@ class JobStore(JobTable):
         cursor: str | None = None,
         owner: str | None = None,
         states: Collection[JobState] = (),
+        parent: str | None = None,
     ) -> tuple[list[Job], str | None]:
-        """Newest first; ``cursor`` is what the page before returned, None when that was the last."""
-        query = select(Job).where(Job.deleted_at.is_(None)).order_by(Job.id.desc()).limit(limit + 1)
+        """Newest first; ``cursor`` is what the page before returned, None when that was the last.
+
+        Jobs of videos, or with ``parent`` the renders of that job.
+        """
+        which = Job.kind == JobKind.FIT if parent is None else Job.parent == parent
+        query = select(Job).where(which, Job.deleted_at.is_(None)).order_by(Job.id.desc()).limit(limit + 1)
         if cursor is not None:
             query = query.where(Job.id < cursor)
         if owner is not None:
@@ -220,12 +231,14 @@ class JobStore(JobTable):
             # It moved between the two statements, say from running back to the queue: once more.
 
     def delete(self, job_id: str) -> bool:
-        """Hide the job for good and stop its worker. False when it is unknown or deleted already.
+        """Hide the job and its renders for good, stop their workers. False when it is unknown or deleted.
 
         The bytes and the row go with :meth:`purge`, once no worker can write any more.
         """
         if self.request_cancel(job_id) is Cancel.UNKNOWN:
             return False
+        for render in self.page(limit=_ALL, parent=job_id)[0]:
+            self.delete(render.id)
         return self._update(Job.id == job_id, Job.deleted_at.is_(None), deleted_at=self._clock())
 
     def due_for_purge(self, limit: int = 100) -> list[str]:
@@ -262,6 +275,7 @@ class JobStore(JobTable):
             "attempt": Job.attempt + 1,
             "started_at": func.coalesce(Job.started_at, now),
             "stage": None,
+            "stage_since": None,
             "fraction": 0.0,
             "message": "",
             "warnings": [],
@@ -283,6 +297,7 @@ class JobStore(JobTable):
             job.from_stage,
             job.traceparent,
             job.queue,
+            job.kind,
         )
 
     def heartbeat(self, job_id: str, token: str, lease_seconds: float = 60.0) -> Heartbeat:

@@ -13,8 +13,9 @@ from typing import Any
 from sqlalchemy import ColumnElement, Engine, func, or_, select, update
 from sqlalchemy.orm import Session, sessionmaker
 
-from service.jobs import journal
+from service.jobs import figures, journal
 from service.jobs.model import FINAL_STATES, HELD_STATES, Job, JobState, sources
+from service.webhooks import outbox
 
 #: Progress is entered in the journal when it has grown by this much.
 _PROGRESS_STEP = 0.005
@@ -35,6 +36,7 @@ class JobTable:
         session.add(job)
         session.flush()
         journal.record(session, job, "state", job.created_at)
+        outbox.enqueue(session, job, job.created_at)
 
     def _move(self, target: JobState, *where: ColumnElement[bool], **values: Any) -> list[Job]:
         """The only statement that writes a state: it leaves none but those the table allows.
@@ -51,7 +53,14 @@ class JobTable:
         with self._session.begin() as session:
             moved = [*session.scalars(statement)]
             for job in moved:
-                journal.record(session, job, "state", self._clock())
+                now = self._clock()
+                journal.record(session, job, "state", now)
+                outbox.enqueue(session, job, now)
+                if job.state not in HELD_STATES:
+                    figures.book_stage(session, job.stage, job.stage_since, now)
+                    job.stage_since = None
+                if job.state == JobState.FAILED:
+                    figures.book_failure(session, job.error_code or "unknown")
         return moved
 
     def _finish(self, target: JobState, *where: ColumnElement[bool], **values: Any) -> list[Job]:
@@ -69,6 +78,7 @@ class JobTable:
             .returning(Job)
             .execution_options(synchronize_session=False)
         )
+        now = self._clock()
         with self._session.begin() as session:
             job = session.scalar(statement)
             if job is None:
@@ -76,9 +86,13 @@ class JobTable:
             last = session.get(journal.JobEvent, (job.id, job.event_seq))
             said = {} if last is None else last.data
             grown = job.fraction - said.get("fraction", 0.0) >= _PROGRESS_STEP
-            if grown or said.get("stage") != job.stage:
+            other = said.get("stage") != job.stage
+            if other:
+                figures.book_stage(session, said.get("stage"), job.stage_since, now)
+                job.stage_since = now
+            if grown or other:
                 job.event_seq += 1
-                journal.record(session, job, "progress", self._clock())
+                journal.record(session, job, "progress", now)
         return True
 
     def _update(self, *where: ColumnElement[bool], **values: Any) -> bool:

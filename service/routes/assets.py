@@ -16,6 +16,7 @@ from service.jobs.schemas import AssetList, AssetView
 from service.problems import Kind, ProblemError, declared
 from service.routes.jobs import JobId
 from service.services import ServicesDep, not_modified
+from service.storage import MEDIA_TYPES
 
 router = APIRouter(prefix="/jobs", tags=["results"])
 
@@ -40,7 +41,12 @@ def list_assets(job_id: JobId, services: ServicesDep, caller: CallerDep) -> Asse
     responses={
         200: {
             "description": "The file.",
-            "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+            "content": {
+                kind: {}
+                if kind.endswith("json")
+                else {"schema": {"type": "string", "contentMediaType": kind}}
+                for kind in sorted(MEDIA_TYPES)
+            },
         },
         206: {"description": "The range asked for (one range; several are answered with the whole file)."},
         304: {"description": "Unchanged since the ETag sent."},

@@ -22,19 +22,27 @@ router = APIRouter(prefix="/jobs", tags=["jobs"])
 JobId = Annotated[str, Path(description="The id `POST /jobs` answered with.", max_length=64)]
 
 
+Cursor = Annotated[str | None, Query(max_length=64, description="`next` of the page before.")]
+
+
+def checked_cursor(cursor: str | None) -> str | None:
+    """The cursor, if it is one. Raises ProblemError (422)."""
+    if cursor is not None and not is_job_id(cursor):
+        error = {"field": "query.cursor", "message": "Not a cursor this service gave out."}
+        raise ProblemError(Kind.REQUEST_INVALID, errors=[error])
+    return cursor
+
+
 @router.get("", responses=declared(Kind.REQUEST_INVALID))
 def list_jobs(
     services: ServicesDep,
     caller: CallerDep,
     limit: Annotated[int, Query(ge=1, le=100)] = 20,
-    cursor: Annotated[str | None, Query(max_length=64, description="`next` of the page before.")] = None,
+    cursor: Cursor = None,
     state: Annotated[list[JobState] | None, Query(max_length=8, description="Only jobs in these.")] = None,
 ) -> JobPage:
     """The jobs, newest first. A job that arrives while the pages are read belongs before the first."""
-    if cursor is not None and not is_job_id(cursor):
-        error = {"field": "query.cursor", "message": "Not a cursor this service gave out."}
-        raise ProblemError(Kind.REQUEST_INVALID, errors=[error])
-    jobs, following = services.store.page(limit, cursor, caller.sees, state or ())
+    jobs, following = services.store.page(limit, checked_cursor(cursor), caller.sees, state or ())
     return JobPage(jobs=[job_view(job) for job in jobs], next=following)
 
 

@@ -61,7 +61,19 @@ _STREAM: dict[int | str, dict[str, Any]] = {
         "the job; an EventSource that comes back after that is told 204 and stays away.",
         "content": {
             "text/event-stream": {
-                "schema": {"type": "string"},
+                "schema": {
+                    "type": "object",
+                    "required": ["data"],
+                    "properties": {
+                        "event": {"type": "string", "enum": ["state", "progress"]},
+                        "id": {"type": "string"},
+                        "data": {
+                            "type": "string",
+                            "contentMediaType": "application/json",
+                            "contentSchema": {"$ref": "#/components/schemas/JobEventData"},
+                        },
+                    },
+                },
                 "example": 'event: progress\nid: 7\ndata: {"seq": 7, "state": "running", "stage": "fit", '
                 '"attempt": 1, "fraction": 0.41, "time_left": 95.0, "message": "", "at": 1780000000.0}\n\n',
             }
@@ -94,11 +106,11 @@ async def watch_job(
         after = max(after, int(last_event_id))
     if job.state in FINAL_STATES and after >= job.event_seq:
         return Response(status_code=204)
-    if not services.streams.room(caller.owner):
+    if not services.streams.room(job.owner):
         raise ProblemError(Kind.STREAMS, headers={"Retry-After": "30"})
 
     async def stream() -> AsyncIterator[bytes]:
-        with services.streams.held(caller.owner):
+        with services.streams.held(job.owner):
             async for event in follow(services.store, job_id, after):
                 yield event
 

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 
 from service.access.gate import CallerDep
-from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, canonical_view
+from service.jobs.model import JobKind
+from service.jobs.schemas import JobPage, JobView, MotionRequest, job_view
+from service.motions import canonical_motion
+from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, View, canonical_view
 from service.problems import Kind, ProblemError, declared
-from service.routes.jobs import JobId
-from service.services import ServicesDep, not_modified
+from service.routes.jobs import Cursor, JobId, checked_cursor
+from service.routes.submission import ACCEPTED, IDEMPOTENCY, IdempotencyKey
+from service.services import Services, ServicesDep, not_modified
+from service.submission import Wanted, fingerprint, spelled, submit
 
 router = APIRouter(prefix="/jobs", tags=["results"])
 
@@ -87,7 +94,7 @@ def render_job(
     ] = "rgb",
 ) -> Response:
     """Render the hand. Repeated requests are answered from a cache; use `If-None-Match`."""
-    artifact = services.artifact(job_id, caller)
+    artifact = services.avatar(job_id, caller)
     most = services.settings.max_render_pixels
     view = canonical_view(pose, camera, width, height, format, most, channel)
     part = _folder(services.storage.published(job_id, artifact), hand)
@@ -96,10 +103,86 @@ def render_job(
     if not_modified(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     picture = services.pictures.get(job_id, artifact, view)
-    if picture is None:
-        picture = services.pool.render(part / "avatar.safetensors", view)
+    if picture is not None:
+        services.metrics.renders.labels("cached").inc()
+    else:
+        picture = _draw(services, part / "avatar.safetensors", view)
         services.pictures.put(job_id, artifact, view, picture)
     return Response(picture, media_type=view.media_type, headers=headers)
+
+
+@router.post(
+    "/{job_id}/renders",
+    status_code=202,
+    responses={
+        **ACCEPTED,
+        **declared(
+            Kind.REQUEST_INVALID,
+            Kind.POSE_INVALID,
+            Kind.CAMERA_INVALID,
+            Kind.RENDER_TOO_LARGE,
+            Kind.RENDER_NO_HAND,
+            Kind.JOB_NOT_READY,
+            Kind.JOB_NO_RESULT,
+            Kind.QUOTA,
+            *IDEMPOTENCY,
+        ),
+    },
+)
+async def create_render(
+    job_id: JobId,
+    request: Request,
+    response: Response,
+    services: ServicesDep,
+    caller: CallerDep,
+    body: MotionRequest | None = None,
+    hand: Hand = None,
+    idempotency_key: IdempotencyKey = None,
+) -> JobView:
+    """Render a motion, as a small job of its own: follow it as any job; its file is the asset `motion.mp4`
+    or `motion.webp`. It is deleted with the job whose hand it shows, or by itself."""
+    motion = canonical_motion(body or MotionRequest(), services.settings)
+
+    def share(new_id: str) -> Wanted:
+        artifact = services.avatar(job_id, caller)
+        part = _folder(services.storage.artifact_path(job_id, artifact), hand)
+        try:
+            avatar = services.storage.share(part / "avatar.safetensors", new_id)
+        except FileNotFoundError:
+            raise ProblemError(Kind.JOB_NO_RESULT) from None
+        mark = fingerprint(f"POST /jobs/{job_id}/renders", part.name, spelled(motion))
+        return Wanted(new_id, motion, avatar, None, mark, kind=JobKind.RENDER, parent=job_id)
+
+    async def receive(new_id: str) -> Wanted:
+        return await run_in_threadpool(share, new_id)
+
+    return job_view(await submit(services, request, response, caller, idempotency_key, receive))
+
+
+@router.get("/{job_id}/renders", responses=declared(Kind.JOB_NOT_FOUND, Kind.REQUEST_INVALID))
+def list_renders(
+    job_id: JobId,
+    services: ServicesDep,
+    caller: CallerDep,
+    limit: Annotated[int, Query(ge=1, le=100)] = 20,
+    cursor: Cursor = None,
+) -> JobPage:
+    """The motions of this job's hand, newest first."""
+    services.job(job_id, caller)
+    jobs, following = services.store.page(limit, checked_cursor(cursor), caller.sees, parent=job_id)
+    return JobPage(jobs=[job_view(job) for job in jobs], next=following)
+
+
+def _draw(services: Services, avatar: Path, view: View) -> bytes:
+    start = time.perf_counter()
+    try:
+        picture = services.pool.render(avatar, view)
+    except ProblemError as error:
+        services.metrics.renders.labels(error.kind.code).inc()
+        raise
+    services.metrics.renders.labels("drawn").inc()
+    services.metrics.render_seconds.observe(time.perf_counter() - start)
+    return picture
 
 
 def _folder(result: Path, hand: str | None) -> Path:

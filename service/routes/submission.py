@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from service.access.gate import CallerDep
 from service.access.keys import Caller
-from service.jobs.model import FINAL_STATES
+from service.jobs.model import FINAL_STATES, JobKind
 from service.jobs.schemas import JobOptions, JobView, RestartRequest, UploadedJob, job_view
 from service.problems import Kind, ProblemError, declared, field_errors
 from service.routes.jobs import JobId
@@ -57,7 +57,7 @@ _FORM: dict[str, Any] = {
     },
 }
 
-_ACCEPTED: dict[int | str, dict[str, Any]] = {
+ACCEPTED: dict[int | str, dict[str, Any]] = {
     202: {
         "description": "Accepted; `Location` is where to look for progress.",
         "headers": {
@@ -69,7 +69,7 @@ _ACCEPTED: dict[int | str, dict[str, Any]] = {
         },
     }
 }
-_IDEMPOTENCY = (Kind.IDEMPOTENCY_IN_PROGRESS, Kind.IDEMPOTENCY_MISMATCH, Kind.JOB_NOT_FOUND)
+IDEMPOTENCY = (Kind.IDEMPOTENCY_IN_PROGRESS, Kind.IDEMPOTENCY_MISMATCH, Kind.JOB_NOT_FOUND)
 
 _MAX_JSON = 64 * 1024
 
@@ -89,7 +89,7 @@ IdempotencyKey = Annotated[
     response_model=JobView,
     openapi_extra={"requestBody": _FORM},
     responses={
-        **_ACCEPTED,
+        **ACCEPTED,
         **declared(
             Kind.REQUEST_MALFORMED,
             Kind.UPLOAD_INCOMPLETE,
@@ -105,7 +105,7 @@ IdempotencyKey = Annotated[
             Kind.QUOTA,
             Kind.UPLOAD_NOT_FOUND,
             Kind.UPLOAD_USED,
-            *_IDEMPOTENCY,
+            *IDEMPOTENCY,
         ),
     },
 )
@@ -155,14 +155,14 @@ async def _uploaded(request: Request) -> UploadedJob:
     status_code=202,
     response_model=JobView,
     responses={
-        **_ACCEPTED,
+        **ACCEPTED,
         **declared(
             Kind.REQUEST_INVALID,
             Kind.OPTIONS_INVALID,
             Kind.JOB_UNFINISHED,
             Kind.JOB_NO_VIDEO,
             Kind.QUOTA,
-            *_IDEMPOTENCY,
+            *IDEMPOTENCY,
         ),
     },
 )
@@ -189,12 +189,16 @@ async def restart_job(
 
 def _again(services: Services, caller: Caller, job_id: str, new_id: str, wish: RestartRequest) -> Wanted:
     job = services.job(job_id, caller)
+    if job.kind != JobKind.FIT:
+        raise ProblemError(Kind.JOB_NO_VIDEO, "It renders a motion; ask its parent for another.")
     if job.state not in FINAL_STATES:
         raise ProblemError(Kind.JOB_UNFINISHED, f"The job is {job.state}.")
     options = changed_options(job.options, wish.options)
     try:
-        video = services.storage.share_upload(job.video, new_id)
+        video = services.storage.share(services.storage.source(job.video), new_id)
     except FileNotFoundError:
         raise ProblemError(Kind.JOB_NO_VIDEO) from None
+    if wish.from_stage is not None:
+        services.storage.share_checkpoint(job_id, new_id)
     mark = fingerprint(f"POST /jobs/{job_id}/restart", wish.from_stage or "", spelled(options))
     return Wanted(new_id, options, video, job.video_bytes, mark, job_id, wish.from_stage)

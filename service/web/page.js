@@ -90,11 +90,15 @@ async function watch(id) {
   show("cancel", Boolean(job.links.cancel) && job.state !== "cancelling");
   show("delete", !job.links.cancel);
   show("result", Boolean(job.links.render));
+  if (job.state === "running") look(job);
+  else show("preview", false);
   if (job.links.cancel) timer = setTimeout(() => watch(id), 1000);
   else list();
   if (job.links.render) {
-    picture();
     const { assets } = await call(job.links.assets);
+    const hands = ["right", "left"].filter((hand) => assets.some((a) => a.name.startsWith(`${hand}/`)));
+    show("hands", hands.length === 2);
+    picture();
     $("assets").replaceChildren(...assets.map((a) => {
       const item = row(a.name, a.href, `${(a.bytes / 1e6).toFixed(2)} MB`);
       item.firstChild.onclick = (event) => { event.preventDefault(); save(id, a.name).catch(complain); };
@@ -103,11 +107,20 @@ async function watch(id) {
   }
 }
 
+async function look(job) { // the hand as it is now; there is none before it is coloured
+  const answer = await fetch(job.links.preview, { headers: auth() });
+  if (!answer.ok || current !== job.id) return;
+  URL.revokeObjectURL($("preview").src);
+  $("preview").src = URL.createObjectURL(await answer.blob());
+  show("preview", true);
+}
+
 async function picture() {
   const camera = `orbit:${$("yaw").value},0`;
   const query = new URLSearchParams({
     pose, camera, width: 512, height: 512, format: "webp", channel: $("channel").value,
   });
+  if (!$("hands").hidden) query.set("hand", $("hand").value);
   $("picture").classList.add("busy");
   for (const button of $("poses").children) button.setAttribute("aria-pressed", button.textContent === pose);
   try {
@@ -133,7 +146,7 @@ $("poses").append(...POSES.map((name) => {
   return button;
 }));
 $("picture").onload = $("picture").onerror = () => $("picture").classList.remove("busy");
-$("yaw").onchange = $("channel").onchange = picture;
+$("yaw").onchange = $("channel").onchange = $("hand").onchange = picture;
 $("file").onchange = (event) => event.target.files[0] && send(event.target.files[0]);
 $("cancel").onclick = () => call(`/jobs/${current}/cancel`, { method: "POST" }).catch(complain);
 $("delete").onclick = async () => {

@@ -38,6 +38,7 @@ class Keyed:
     keys: dict[str, str]
     job: str
     upload: str
+    webhook: str
 
     def send(self, who: str, method: str, path: str, **arguments: object) -> httpx.Response:
         headers = {"Tus-Resumable": "1.0.0"}
@@ -47,7 +48,13 @@ class Keyed:
 
     def at(self, path: str) -> str:
         """The path with its names filled in: Ann's finished job, and things that exist in it."""
-        names = {"upload_id": self.upload, "job_id": self.job, "name": "report.json", "code": "video.empty"}
+        names = {
+            "webhook_id": self.webhook,
+            "upload_id": self.upload,
+            "job_id": self.job,
+            "name": "report.json",
+            "code": "video.empty",
+        }
         return path.replace(":path", "").format_map(_Names(names))
 
 
@@ -82,8 +89,9 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
         live.http.headers["Authorization"] = f"Bearer {keys['owner']}"
         job, _ = live.finished()
         upload = live.http.post("/uploads", headers={"Tus-Resumable": "1.0.0", "Upload-Length": "9"})
+        hook = live.http.post("/webhooks", json={"url": "https://example.com/hook"}).json()["id"]
         del live.http.headers["Authorization"]
-        yield Keyed(live, keys, job, upload.headers["Location"].rpartition("/")[2])
+        yield Keyed(live, keys, job, upload.headers["Location"].rpartition("/")[2], hook)
 
 
 def test_there_is_something_to_test() -> None:

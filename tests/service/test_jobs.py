@@ -24,6 +24,7 @@ def test_a_job_is_followed_from_queue_to_failure(live: Live) -> None:
         "restart": None,
         **{name: f"/jobs/{job_id}/{name}" for name in ("events", "logs", "preview")},
         "render": None,
+        "renders": None,
         "assets": None,
     }
     claim = live.services.store.claim(job_id)

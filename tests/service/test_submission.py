@@ -87,6 +87,31 @@ def test_a_restart_uses_the_video_again_with_other_options(live: Live) -> None:
     assert live.services.storage.source(claim.video).read_bytes() == VIDEO
 
 
+def test_a_restart_from_a_stage_takes_the_checkpoint_along(live: Live) -> None:
+    job_id = live.submit()
+    store, storage = live.services.store, live.services.storage
+    claim = store.claim(job_id)
+    assert claim is not None
+    checkpoint = storage.attempt_dir(job_id, claim.artifact) / "checkpoint"
+    (checkpoint / "deep").mkdir(parents=True)
+    (checkpoint / "deep" / "state").write_bytes(b"how far it was")
+    (checkpoint / "link").symlink_to("/etc/passwd")
+    store.fail(job_id, claim.token, "c", "m", "a")
+    plain = live.http.post(f"/jobs/{job_id}/restart").json()["id"]
+    assert not [file for file in live.files() if plain in file and "checkpoint" in file]
+    headers = {"Idempotency-Key": new_job_id()}
+    wish = {"from_stage": "fit"}
+    again = live.http.post(f"/jobs/{job_id}/restart", json=wish, headers=headers).json()["id"]
+    files = live.files()
+    copied = [file for file in files if again in file and "checkpoint" in file]
+    assert copied == [f"jobs/{again}/0-restart/checkpoint/deep/state"]
+    live.http.post(f"/jobs/{job_id}/restart", json=wish, headers=headers)
+    assert live.files() == files  # a repeated request leaves nothing behind
+    for each in (plain, again, job_id):
+        live.http.delete(f"/jobs/{each}")
+    assert not [file for file in live.files() if again in file]
+
+
 def test_a_restart_is_idempotent_and_checked(live: Live) -> None:
     job_id = live.submit()
     live.http.post(f"/jobs/{job_id}/cancel")

@@ -93,6 +93,7 @@ def test_a_restarted_job_goes_on_from_what_the_first_one_left(bench: Bench) -> N
     bench.store.request_cancel(first)
     bench.until(first, "cancelled")
     second = bench.job("steps", restarted_from=first)
+    assert bench.storage.share_checkpoint(first, second)
     bench.publish(second)
     assert bench.until(second, "succeeded").attempt == 1
     assert (_begun(bench, second), _steps(bench, second)) == (["resume"], [*range(5, 10)])

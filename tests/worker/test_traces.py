@@ -2,59 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import json
-import logging
 
-import pytest
-
-from service.logs import JsonFormatter, TextFormatter, about
 from tests.worker.api_process import api
 from tests.worker.harness import Bench, wait_for
 
 TRACE, SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 TRACEPARENT = f"00-{TRACE}-{SPAN}-01"
-
-
-@pytest.fixture
-def stream() -> io.StringIO:
-    return io.StringIO()
-
-
-def _logger(stream: io.StringIO, formatter: logging.Formatter) -> logging.Logger:
-    logger = logging.Logger("test")
-    handler = logging.StreamHandler(stream)
-    handler.setFormatter(formatter)
-    logger.addHandler(handler)
-    return logger
-
-
-def test_a_line_of_json_says_what_it_is_about(stream: io.StringIO) -> None:
-    logger = _logger(stream, JsonFormatter("worker"))
-    logger.info("before")
-    with about("a-job", TRACEPARENT, attempt="2"):
-        logger.warning("with a\nline break and %s", "ä")
-        try:
-            raise ValueError("deep inside")
-        except ValueError:
-            logger.exception("bad")
-    before, during, bad = map(json.loads, stream.getvalue().splitlines())
-    assert "job" not in before
-    assert (during["job"], during["attempt"]) == ("a-job", "2")
-    assert (during["trace_id"], during["parent_span_id"]) == (TRACE, SPAN)
-    assert (during["level"], during["message"]) == ("warning", "with a\nline break and ä")
-    assert "deep inside" in bad["error"]
-
-
-def test_a_trace_that_is_none_is_left_out(stream: io.StringIO) -> None:
-    logger = _logger(stream, TextFormatter("worker"))
-    with about("a-job", "not a trace"):
-        logger.info("plain")
-    with about("a-job", TRACEPARENT):
-        logger.info("traced")
-    plain, traced = stream.getvalue().splitlines()
-    assert plain.endswith("plain")
-    assert traced.endswith(f"traced [trace {TRACE}]")
 
 
 def test_one_trace_goes_from_the_request_through_the_row_and_the_worker_to_the_engine() -> None:
@@ -75,8 +29,8 @@ def test_one_trace_goes_from_the_request_through_the_row_and_the_worker_to_the_e
         wait_for("the worker has said so", lambda: "attempt 1 succeeded" in worker.log)
         lines = [json.loads(line) for line in worker.log.splitlines() if line.startswith("{")]
         about_it = [line for line in lines if line.get("job") == job_id]
-        assert {line["trace_id"] for line in about_it} == {TRACE}
-        assert {line["process"] for line in lines} == {"worker"}
+        assert {line["trace"] for line in about_it} == {TRACE}
+        assert {line["part"] for line in lines} == {"worker"}
         assert len(about_it) >= 2
     finally:
         bench.close()

@@ -24,6 +24,11 @@ def upgrade() -> None:
     sa.Column('revoked_at', sa.Double(), nullable=True),
     sa.PrimaryKeyConstraint('id')
     )
+    op.create_table('failure_counts',
+    sa.Column('code', sa.String(length=80), nullable=False),
+    sa.Column('jobs', sa.Integer(), nullable=False),
+    sa.PrimaryKeyConstraint('code')
+    )
     op.create_table('idempotency_keys',
     sa.Column('owner', sa.String(length=64), nullable=False),
     sa.Column('key', sa.String(length=128), nullable=False),
@@ -37,8 +42,11 @@ def upgrade() -> None:
     op.create_table('jobs',
     sa.Column('id', sa.String(length=36), nullable=False),
     sa.Column('owner', sa.String(length=64), nullable=False),
+    sa.Column('kind', sa.String(length=20), nullable=False),
+    sa.Column('parent', sa.String(length=36), nullable=True),
     sa.Column('state', sa.Enum('awaiting_upload', 'queued', 'running', 'cancelling', 'succeeded', 'failed', 'cancelled', 'expired', name='jobstate', native_enum=False, length=20), nullable=False),
     sa.Column('stage', sa.String(length=40), nullable=True),
+    sa.Column('stage_since', sa.Double(), nullable=True),
     sa.Column('fraction', sa.Double(), nullable=False),
     sa.Column('time_left', sa.Double(), nullable=True),
     sa.Column('message', sa.Text(), nullable=False),
@@ -73,9 +81,16 @@ def upgrade() -> None:
     )
     with op.batch_alter_table('jobs', schema=None) as batch_op:
         batch_op.create_index('ix_jobs_owner', ['owner', 'id'], unique=False)
+        batch_op.create_index('ix_jobs_parent', ['parent'], unique=False)
         batch_op.create_index('ix_jobs_state_lease', ['state', 'lease_until'], unique=False)
         batch_op.create_index('ix_jobs_state_publish', ['state', 'publish_due_at'], unique=False)
 
+    op.create_table('stage_times',
+    sa.Column('stage', sa.String(length=40), nullable=False),
+    sa.Column('runs', sa.Integer(), nullable=False),
+    sa.Column('seconds', sa.Double(), nullable=False),
+    sa.PrimaryKeyConstraint('stage')
+    )
     op.create_table('uploads',
     sa.Column('id', sa.String(length=36), nullable=False),
     sa.Column('owner', sa.String(length=64), nullable=False),
@@ -91,6 +106,36 @@ def upgrade() -> None:
     with op.batch_alter_table('uploads', schema=None) as batch_op:
         batch_op.create_index('ix_uploads_expiry', ['expires_at'], unique=False)
         batch_op.create_index('ix_uploads_owner', ['owner'], unique=False)
+
+    op.create_table('webhook_endpoints',
+    sa.Column('id', sa.String(length=36), nullable=False),
+    sa.Column('owner', sa.String(length=64), nullable=False),
+    sa.Column('url', sa.Text(), nullable=False),
+    sa.Column('events', sa.JSON(), nullable=False),
+    sa.Column('secret', sa.String(length=100), nullable=False),
+    sa.Column('created_at', sa.Double(), nullable=False),
+    sa.Column('disabled_at', sa.Double(), nullable=True),
+    sa.PrimaryKeyConstraint('id')
+    )
+    with op.batch_alter_table('webhook_endpoints', schema=None) as batch_op:
+        batch_op.create_index(batch_op.f('ix_webhook_endpoints_owner'), ['owner'], unique=False)
+
+    op.create_table('webhook_messages',
+    sa.Column('id', sa.String(length=40), nullable=False),
+    sa.Column('endpoint_id', sa.String(length=36), nullable=False),
+    sa.Column('event', sa.String(length=30), nullable=False),
+    sa.Column('body', sa.Text(), nullable=False),
+    sa.Column('created_at', sa.Double(), nullable=False),
+    sa.Column('due_at', sa.Double(), nullable=False),
+    sa.Column('attempts', sa.Integer(), nullable=False),
+    sa.Column('finished_at', sa.Double(), nullable=True),
+    sa.Column('delivered', sa.Boolean(), nullable=False),
+    sa.Column('outcome', sa.String(length=200), nullable=False),
+    sa.PrimaryKeyConstraint('id')
+    )
+    with op.batch_alter_table('webhook_messages', schema=None) as batch_op:
+        batch_op.create_index('ix_webhook_due', ['finished_at', 'due_at'], unique=False)
+        batch_op.create_index('ix_webhook_endpoint', ['endpoint_id', 'created_at'], unique=False)
 
     op.create_table('job_events',
     sa.Column('job_id', sa.String(length=36), nullable=False),

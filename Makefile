@@ -35,8 +35,8 @@ bench: setup
 	$(BIN)/mass-engine bench raster
 	$(BIN)/mass-engine bench render
 
-openapi: setup
-	$(BIN)/python -m service.openapi > openapi/openapi.json
+openapi: setup  # BREAK=1 for a change that breaks clients
+	$(BIN)/python -m service.openapi $(if $(BREAK),--break)
 
 clean:
 	rm -rf build dist demo-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -18,7 +18,7 @@ from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.evaluation.arguments import add_eval_arguments
 from mass_engine.fitting.components import BINDINGS, Components
 from mass_engine.options import DEVICES, PRESETS, SEGMENTERS, SIDES, FitOptions
-from mass_engine.progress import Progress
+from mass_engine.progress import FIT_STAGES, Progress
 
 #: Parts of the method that ``--no-...`` switches off.
 COMPONENT_SWITCHES = {
@@ -80,6 +80,18 @@ def build_parser() -> argparse.ArgumentParser:
     fit.add_argument("--fov", type=float, metavar="DEGREES", help="field of view of the longer image side")
     fit.add_argument("--max-frames", type=int, default=FitOptions.max_frames, metavar="N")
     fit.add_argument("--resume", action="store_true", help="go on with the killed fit in RUN")
+    fit.add_argument(
+        "--from-stage",
+        choices=tuple(FIT_STAGES),
+        help="with --resume: do this stage and the later ones again",
+    )
+    fit.add_argument(
+        "--max-seconds",
+        type=float,
+        default=FitOptions.max_seconds,
+        metavar="S",
+        help="refuse a longer video",
+    )
     fit.add_argument("--json", action="store_true", help="progress as JSON lines on standard output")
     _add_components(fit)
     fit.set_defaults(run=_fit)
@@ -107,6 +119,20 @@ def build_parser() -> argparse.ArgumentParser:
         help="a .png, .webp or .jpg picture, or the channel's numbers as .npy; with --frames a directory",
     )
     render.set_defaults(run=_render)
+
+    animate = commands.add_parser("animate", help="a moving hand: poses in turn, or a turn around one")
+    animate.add_argument("run_dir", type=Path, metavar="RUN")
+    animate.add_argument(
+        "--motion",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help='JSON: kind ("poses", "turntable"), poses, between, loop, seconds, camera, width, height, fps, '
+        'format ("mp4", "webp"); every one may be left out',
+    )
+    animate.add_argument("--out", type=Path, required=True, help="directory for motion.mp4 or motion.webp")
+    animate.add_argument("--json", action="store_true", help="progress as JSON lines on standard output")
+    animate.set_defaults(run=_animate)
 
     export = commands.add_parser("export", help="write the avatar's surfels for other tools")
     export.add_argument("run_dir", type=Path, metavar="RUN")
@@ -199,12 +225,14 @@ def _fit(arguments: argparse.Namespace) -> None:
         fov=arguments.fov,
         max_frames=arguments.max_frames,
         resume=arguments.resume,
+        from_stage=arguments.from_stage,
         components=Components(
             **{name: getattr(arguments, name) for name in COMPONENT_SWITCHES},
             exposure=arguments.exposure,
             binding=arguments.binding,
             levels=arguments.levels,
         ),
+        max_seconds=arguments.max_seconds,
     )
     # Heavy imports only once the arguments are good.
     from mass_engine.pipeline import fit_hands_to_directory, fit_to_directory
@@ -258,6 +286,20 @@ def _render(arguments: argparse.Namespace) -> None:
             arguments.channel,
         )
         print(f"wrote {arguments.out}")
+
+
+def _animate(arguments: argparse.Namespace) -> None:
+    from mass_engine.motion import animate, read_motion
+
+    def report(fraction: float) -> None:
+        if arguments.json:
+            _emit(type="progress", stage="render", fraction=round(fraction, 4), time_left=None, message="")
+
+    file = animate(arguments.run_dir, read_motion(arguments.motion), arguments.out, report)
+    if arguments.json:
+        _emit(type="done", report=str(file))
+    else:
+        print(f"wrote {file}")
 
 
 def _export(arguments: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mass_engine.errors import BadArgumentError
 from mass_engine.fitting.components import Components
+from mass_engine.progress import FIT_STAGES
 from mass_engine.template_spec import parse_template
 from mass_engine.tracks_spec import parse_tracks
 
@@ -31,10 +32,11 @@ class FitOptions:
     ``holdout`` N keeps the frames N-1, 2N-1, ... out of the fit (0: none). ``fov`` in degrees spans the
     longer image side; None takes what the file says or a phone-like default; the report says which.
     ``max_frames`` bounds the frames the fit sees; held-out frames do not count, of which at most 160 (or
-    ``max_frames``, if that is more) are kept, evenly spread.
+    ``max_frames``, if that is more) are kept, evenly spread. A video of more than ``max_seconds`` is refused.
 
     ``resume``: go on after the last step that a killed fit of the same clip and options left in the run's
-    directory. ``components``: parts of the method to switch off.
+    directory; of that only what comes before ``from_stage`` (one of the report's stages). ``components``:
+    parts of the method to switch off.
     """
 
     template: str = "builtin"
@@ -50,7 +52,9 @@ class FitOptions:
     fov: float | None = None
     max_frames: int = 160
     resume: bool = False
+    from_stage: str | None = None
     components: Components = field(default_factory=Components)
+    max_seconds: float = 600.0
 
     def __post_init__(self) -> None:
         checks = (
@@ -72,6 +76,18 @@ class FitOptions:
             (self.holdout == 0 or self.holdout >= 2, "holdout", self.holdout, "Use 0, or 2 and more."),
             (self.fov is None or 5 <= self.fov <= 150, "fov", self.fov, "Use 5 to 150 degrees."),
             (2 <= self.max_frames <= 10_000, "max_frames", self.max_frames, "Use 2 to 10000."),
+            (
+                0 < self.max_seconds < 1e6,
+                "max_seconds",
+                self.max_seconds,
+                "Use a positive number of seconds.",
+            ),
+            (
+                self.from_stage is None or self.from_stage in FIT_STAGES,
+                "from_stage",
+                self.from_stage,
+                f"Use one of {', '.join(FIT_STAGES)}.",
+            ),
             (0 <= self.seed < 2**63, "seed", self.seed, "Use a number from 0 on."),
         )
         for good, name, value, advice in checks:

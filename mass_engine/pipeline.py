@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mass_engine.avatar import Avatar, row_pose
 from mass_engine.errors import BadArgumentError
 from mass_engine.evaluation.scores import mean_scores, score_view
 from mass_engine.export.ply import write_ply
+from mass_engine.fitting.looks import Show
 from mass_engine.fitting.report import (
     SHARED_STAGES,
     FitReport,
@@ -25,7 +28,6 @@ from mass_engine.fitting.report import (
     versions,
 )
 from mass_engine.fitting.schedule import schedule_for
-from mass_engine.fitting.state import FILE_NAME as CHECKPOINT
 from mass_engine.fitting.trainer import FitResult, fit_hand
 from mass_engine.options import FitOptions
 from mass_engine.preprocess import Clip, prepare_hand
@@ -34,6 +36,8 @@ from mass_engine.survey import Survey, SurveyedHand, Warn, survey
 from mass_engine.tracking.sides import SIDES
 from mass_engine.tracking.tracks import Tracks, write_tracks
 
+#: Where a RUN directory keeps the steps of a fit that is not finished.
+CHECKPOINTS = "checkpoint"
 #: Frames shown in previews/.
 PREVIEWS = 8
 
@@ -56,9 +60,11 @@ def fit(
     options: FitOptions | None = None,
     report: Report | None = None,
     warn: Warn | None = None,
-    checkpoint: Path | None = None,
+    show: Show | None = None,
+    checkpoints: Path | None = None,
 ) -> FitOutcome:
-    """Reconstruct the hand in ``video``; finished steps are kept in the file ``checkpoint`` until the end.
+    """Reconstruct the hand in ``video``; finished steps are kept in the folder ``checkpoints``. ``show``
+    gets a look at it now and then.
 
     Raises EngineError when the video cannot be used, BadArgumentError ``options.invalid`` for
     ``side="both"``: see :func:`fit_hands`.
@@ -71,7 +77,7 @@ def fit(
     notes = _Notes(warn)
     meter = ProgressMeter(report or (lambda _: None))
     found = survey(video, options, meter, notes)
-    return _fit_hand(video, found, found.hands[0], options, meter, notes, checkpoint)
+    return _fit_hand(video, found, found.hands[0], options, meter, notes, show, checkpoints)
 
 
 def fit_hands(
@@ -79,13 +85,14 @@ def fit_hands(
     options: FitOptions | None = None,
     report: Report | None = None,
     warn: Warn | None = None,
-    out: Path | None = None,
+    show: Show | None = None,
+    checkpoints: Path | None = None,
 ) -> Iterator[FitOutcome]:
     """Reconstruct both hands of the person in ``video`` (or the one there is), the right one first.
 
     ``options.side`` is taken as ``both``. One hand after the other, as the results are asked for: only one
-    of them is in memory. Finished steps are kept in ``out/right`` and ``out/left`` until each is done. Raises
-    EngineError when the video cannot be used.
+    of them is in memory. Finished steps are kept in the folder ``checkpoints``. Raises EngineError when the
+    video cannot be used.
     """
     options = replace(options or FitOptions(), side="both")
     shared = {name: share for name, share in FIT_STAGES.items() if name in SHARED_STAGES}
@@ -100,8 +107,7 @@ def fit_hands(
         note = f"{hand.side} hand" if len(found.hands) > 1 else ""
         part = ProgressMeter(whole.part(first + number * share, share, note), own)
         part.seconds |= meter.seconds
-        checkpoint = None if out is None else out / hand.side / CHECKPOINT
-        yield _fit_hand(video, found, hand, options, part, notes, checkpoint)
+        yield _fit_hand(video, found, hand, options, part, notes, show, checkpoints)
 
 
 class _Notes:
@@ -144,10 +150,10 @@ def _fit_hand(
     options: FitOptions,
     meter: ProgressMeter,
     notes: _Notes,
-    checkpoint: Path | None,
+    show: Show | None,
+    checkpoints: Path | None,
 ) -> FitOutcome:
-    if checkpoint is not None and not options.resume:
-        checkpoint.unlink(missing_ok=True)
+    checkpoint = None if checkpoints is None else _checkpoint(checkpoints, hand.side, options)
     clip = prepare_hand(video, found, hand, options, meter)
     meter.update("convert", 0.0)
     result = fit_hand(
@@ -160,6 +166,7 @@ def _fit_hand(
         lambda fraction, message: meter.update("fit", fraction, message),
         options.components,
         checkpoint,
+        show,
     )
     found_out = result.state.notes
     if found_out.get("undone_steps"):
@@ -211,6 +218,17 @@ def _fit_hand(
     return FitOutcome(result.avatar, summary, tracks, clip)
 
 
+def _checkpoint(folder: Path, side: str, options: FitOptions) -> Path:
+    """The file that keeps the finished steps of one hand's fit; what is not to be gone on with is removed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{side}.safetensors"
+    stages = list(FIT_STAGES)
+    anew = options.from_stage is not None and stages.index(options.from_stage) <= stages.index("fit")
+    if anew or not options.resume:
+        file.unlink(missing_ok=True)
+    return file
+
+
 def fit_to_directory(
     video: Path,
     out: Path,
@@ -220,7 +238,7 @@ def fit_to_directory(
 ) -> FitReport:
     """:func:`fit`, with everything the command line promises written to ``out``."""
     out.mkdir(parents=True, exist_ok=True)
-    return _write(fit(video, options, report, warn, out / CHECKPOINT), out)
+    return _write(fit(video, options, report, warn, _live_preview(out), out / CHECKPOINTS), out)
 
 
 def fit_hands_to_directory(
@@ -234,20 +252,32 @@ def fit_hands_to_directory(
     itself gets the report and the tracks of both."""
     out.mkdir(parents=True, exist_ok=True)
     for side in SIDES:
-        if not options.resume:
-            shutil.rmtree(out / side, ignore_errors=True)
-        (out / side).mkdir(exist_ok=True)
+        shutil.rmtree(out / side, ignore_errors=True)
     reports, tracks = [], []
-    for outcome in fit_hands(video, options, report, warn, out):
+    for outcome in fit_hands(video, options, report, warn, _live_preview(out), out / CHECKPOINTS):
         folder = out / outcome.report.side
+        folder.mkdir()
         reports.append(_write(outcome, folder))
         tracks.append(outcome.tracks)
     write_tracks(tracks, out / "tracks.json")
-    for side in {*SIDES} - {single.side for single in reports}:
-        shutil.rmtree(out / side)
+    shutil.rmtree(out / CHECKPOINTS, ignore_errors=True)
+    shutil.rmtree(out / "previews", ignore_errors=True)
     both = HandsReport.of(reports)
     both.write(out)
     return both
+
+
+def _live_preview(out: Path) -> Show:
+    """Keeps the latest look at the hand in ``out/previews/live.jpg``, which the results replace."""
+
+    def show(picture: NDArray[np.uint8]) -> None:
+        folder = out / "previews"
+        folder.mkdir(exist_ok=True)
+        part = folder / "live.part.jpg"
+        cv2.imwrite(str(part), picture[..., ::-1])
+        part.replace(folder / "live.jpg")  # whoever reads it sees one picture or the other
+
+    return show
 
 
 def _write(outcome: FitOutcome, out: Path) -> FitReport:
@@ -256,7 +286,7 @@ def _write(outcome: FitOutcome, out: Path) -> FitReport:
     write_ply(outcome.avatar.cloud("rest"), out / "surfels.ply", "2dgs")
     _write_previews(outcome, out / "previews")
     outcome.report.write(out)
-    (out / CHECKPOINT).unlink(missing_ok=True)
+    shutil.rmtree(out / CHECKPOINTS, ignore_errors=True)
     return outcome.report
 
 

@@ -30,6 +30,7 @@ from mass_engine.tracking.sam_hq import Predictor, SamHqSegmenter
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE, HandMask, HandSegmenter, hand_box
 from mass_engine.tracking.tracks import Tracks
 from mass_engine.video.ahead import ahead
+from mass_engine.video.limits import VideoLimits
 from mass_engine.video.reader import VideoInfo, read_frames
 
 #: Crops larger than this on a side are reduced: a fit in minutes cannot use more.
@@ -131,7 +132,7 @@ def _cut_views(
     crops: list[tuple[HandLandmarks, tuple[int, int, int, int], NDArray[np.uint8]]] = []
     wanted = {mark.index: mark for mark in marks}
     last = max(wanted)
-    for frame in ahead(read_frames(video)):
+    for frame in ahead(read_frames(video, VideoLimits(max_seconds=options.max_seconds))):
         mark = wanted.get(frame.index)
         if mark is not None:
             x, y, w, h = box = hand_box(mark.points, *frame.rgb.shape[:2])

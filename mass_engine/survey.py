@@ -26,6 +26,7 @@ from mass_engine.tracking.tracker import TrackerOptions
 from mass_engine.tracking.tracks import Tracks
 from mass_engine.tracks_spec import parse_tracks
 from mass_engine.video.ahead import ahead
+from mass_engine.video.limits import VideoLimits
 from mass_engine.video.reader import Frame, VideoInfo, VideoWarning, probe, read_frames
 
 #: Field of view of the longer image side when nothing tells it, degrees: a phone's main camera.
@@ -78,13 +79,14 @@ def survey(video: Path, options: FitOptions, meter: ProgressMeter, warn: Warn) -
     template = load_template(parse_template(options.template))
     for code, message in template.notes:
         warn(code, message, "Look at the result with care.")
-    info = probe(video)
+    limits = VideoLimits(max_seconds=options.max_seconds)
+    info = probe(video, limits)
     camera, source = survey_camera(info, options)
     times: dict[int, float] = {}
     heard: list[VideoWarning] = []
 
     def frames() -> Iterator[Frame]:
-        for frame in ahead(read_frames(video, on_warning=heard.append)):
+        for frame in ahead(read_frames(video, limits, heard.append)):
             times[frame.index] = frame.time
             if info.frames:
                 meter.update("track", frame.index / info.frames)

@@ -35,6 +35,14 @@ fi
 command -v c++ >/dev/null || command -v g++ >/dev/null || command -v clang++ >/dev/null || need_packages g++
 "$PYTHON" -c 'import os, sysconfig; raise SystemExit(not os.path.exists(os.path.join(sysconfig.get_path("include"), "Python.h")))' \
     || need_packages "python$version-dev"
+# The tests bring up a real server; everything else does without it.
+if ! command -v initdb >/dev/null && ! ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1; then
+    if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+        need_packages postgresql
+    else
+        say "for the tests, please install PostgreSQL: sudo apt-get install postgresql"
+    fi
+fi
 
 [ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV"
 export PIP_CONSTRAINT="$PWD/constraints.txt" PIP_DISABLE_PIP_VERSION_CHECK=1

@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 from fastapi.openapi.utils import get_openapi
-from fastapi.responses import FileResponse
 from fastapi.routing import APIRoute
 from fastapi.staticfiles import StaticFiles
 
 from service import problems
+from service.access.gate import Gate, asks_for_keys, is_public
+from service.access.keys import KeyStore
+from service.bodies import BodyLimit
 from service.guard import Guard
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
+from service.jobs.schemas import UploadedJob
+from service.observing import Observer
 from service.problems import Kind, ProblemBody, declared
 from service.rendering import Loader, load_avatar
-from service.routes import assets, jobs, renders, system
-from service.services import open_services
+from service.routes import assets, jobs, links, page, progress, renders, submission, system, uploads, webhooks
+from service.routes.progress import JobEventData
+from service.services import Services, open_services
 from service.settings import Settings
+from service.webhooks.sender import Sender
 
-_WEB = Path(__file__).parent / "web"
+_WEBHOOK_GRACE = 3.0
+#: What every route but the public ones may answer.
+ACCESS = (Kind.ACCESS_KEY, Kind.ACCESS_SCOPE, Kind.ACCESS_LINK)
 
 
 def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
@@ -34,38 +42,72 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         with open_services(settings, loader) as services:
             app.state.services = services
+            app.state.signer = services.signer
+            app.state.api_keys = KeyStore(services.store.engine)
             await run_in_threadpool(purge_deleted, services.store, services.storage)
             await run_in_threadpool(
                 sweep_uploads, services.store, services.storage, settings.orphan_upload_seconds
             )
-            yield
+            with _webhooks(services):
+                yield
 
     app = FastAPI(
         title="MASS",
         version=version("mass-hand"),
         summary="A phone video of a hand in, a posable hand of 2-D Gaussian surfels out.",
         lifespan=lifespan,
+        docs_url=None,
         redoc_url=None,
         generate_unique_id_function=_operation_id,
         separate_input_output_schemas=False,
     )
     problems.install(app)
     everywhere = declared(Kind.REQUEST_HOST, Kind.REQUEST_ORIGIN, Kind.INTERNAL)
-    for router in (jobs.router, renders.router, assets.router, system.router):
+    for router in (
+        submission.router,
+        jobs.router,
+        progress.router,
+        renders.router,
+        assets.router,
+        links.router,
+        uploads.router,
+        webhooks.router,
+        system.router,
+    ):
         app.include_router(router, responses=everywhere)
-    app.add_api_route("/", _page, include_in_schema=False)
-    app.mount("/web", StaticFiles(directory=_WEB), name="web")
+    app.include_router(page.router)
+    app.mount("/web", StaticFiles(directory=page.WEB), name="web")
+    app.add_middleware(BodyLimit)
+    app.add_middleware(Gate, keyed=asks_for_keys(settings.auth, settings.host))
     app.add_middleware(Guard, hosts=frozenset({settings.host, *settings.allowed_hosts}))
+    app.add_middleware(Observer)
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     return app
 
 
-def _page() -> FileResponse:
-    return FileResponse(_WEB / "index.html", headers={"Cache-Control": "no-cache"})
+@contextmanager
+def _webhooks(services: Services) -> Iterator[None]:
+    """Messages are sent by a thread of each API process; which one sends a message is left to chance."""
+    stopping = threading.Event()
+    sender = Sender(services.outbox, private=services.settings.webhook_private)
+    thread = threading.Thread(target=sender.run, args=(stopping,), name="webhooks", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        thread.join(_WEBHOOK_GRACE)
 
 
 def _operation_id(route: APIRoute) -> str:
     return route.name
+
+
+def _add_answer(answers: dict[str, Any], status: str, answer: dict[str, Any]) -> None:
+    if status in answers:
+        said = (answers[status]["description"], answer["description"])
+        answer = {**answer, "description": "; ".join(said)}
+    answers[status] = answer
 
 
 def _document(app: FastAPI) -> dict[str, Any]:
@@ -73,9 +115,24 @@ def _document(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         schemas = document["components"]["schemas"]
-        body = ProblemBody.model_json_schema(ref_template="#/components/schemas/{model}")
-        schemas.update(body.pop("$defs"), ProblemBody=body)
-        for operation in (item for path in document["paths"].values() for item in path.values()):
+        for model in (ProblemBody, UploadedJob, JobEventData):  # none of them is a route's declared type
+            body = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas.update(body.pop("$defs", {}), **{model.__name__: body})
+        for items in document["paths"].values():
+            for operation in items.values():
+                if "requestBody" in operation:
+                    bodies = declared(Kind.REQUEST_MALFORMED, Kind.UPLOAD_STALLED, Kind.REQUEST_TOO_LARGE)
+                    declares = operation["responses"]
+                    declares |= {str(s): a for s, a in bodies.items() if str(s) not in declares}
+        scheme = {"type": "http", "scheme": "bearer", "description": "A key of `mass keys create`."}
+        document["components"]["securitySchemes"] = {"key": scheme}
+        for path, operation in (
+            (path, item) for path, items in document["paths"].items() for item in items.values()
+        ):
+            if not is_public(path):
+                operation["security"] = [{"key": []}, {}]
+                for status, answer in declared(*ACCESS).items():
+                    _add_answer(operation["responses"], str(status), answer)
             # Added by the framework wherever there is a parameter; ours are declared by the routes.
             if "application/json" in operation["responses"].get("422", {}).get("content", {}):
                 del operation["responses"]["422"]

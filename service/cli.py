@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import os
 import socket
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from service.client import DEFAULT_URL, AssetInfo, JobInfo, MassClient, ServiceError
+from service.keys_command import add_parser as add_keys_parser
+from service.logs import configure as configure_logs
+from service.processes import hide_memory
 from service.progress import FollowBar, transfer_bar
 
 _FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
@@ -51,11 +54,11 @@ def _serve(options: argparse.Namespace) -> int:
     from service.embedded import BrokerError
     from service.serve import ServeError, serve
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s serve %(levelname)s %(message)s")
-    logging.getLogger("httpx").setLevel(logging.WARNING)
+    hide_memory()
     settings = _settings(options)
     if settings is None:
         return 2
+    configure_logs("serve", settings.log_format)
     try:
         return serve(settings, options.workers)
     except (ServeError, BrokerError) as error:
@@ -67,15 +70,17 @@ def _api(options: argparse.Namespace) -> int:
 
     from service.app import create_app
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s api[%(process)d] %(levelname)s %(message)s")
+    hide_memory()
     settings = _settings(options)
     if settings is None:
         return 2
+    configure_logs("api", settings.log_format)
     # Open event streams and downloads may not hold up a stop for longer than this.
     config = uvicorn.Config(
         create_app(settings),
         host=settings.host,
         port=settings.port,
+        log_config=None,
         log_level="warning",
         access_log=False,
         server_header=False,
@@ -171,6 +176,46 @@ def _render(options: argparse.Namespace) -> int:
     return 0
 
 
+def _animate(options: argparse.Namespace) -> int:
+    width, height = options.size
+    motion = {
+        "kind": "turntable" if options.poses is None else "poses",
+        "poses": (options.poses or "rest").split(";"),
+        "camera": options.camera,
+        "width": width,
+        "height": height,
+        "fps": options.fps,
+        "seconds": options.seconds,
+        "format": options.out.suffix.lower().removeprefix("."),
+    }
+    with MassClient(options.url) as client:
+        job = client.animate(options.id, motion)
+        with FollowBar() as bar:
+            job = client.wait(job.id, bar.show)
+        if job.state != "succeeded":
+            return _verdict(job)
+        with tempfile.TemporaryDirectory(dir=options.out.parent) as folder:
+            for asset in client.assets(job.id):
+                _fetch(client, job.id, asset, Path(folder)).replace(options.out)
+        client.delete(job.id)
+    print(options.out)
+    return 0
+
+
+def _restart(options: argparse.Namespace) -> int:
+    with MassClient(options.url) as client:
+        job = client.restart(options.id, dict(options.option), options.from_stage)
+        print(job.id, flush=True)
+        return _follow(client, job.id) if options.wait else 0
+
+
+def _logs(options: argparse.Namespace) -> int:
+    with MassClient(options.url) as client:
+        for line in client.logs(options.id):
+            print(line)
+    return 0
+
+
 def _download(options: argparse.Namespace) -> int:
     with MassClient(options.url) as client:
         assets = client.assets(options.id)
@@ -253,10 +298,25 @@ def _parser() -> argparse.ArgumentParser:
         "--channel", default="rgb", metavar="rgb|alpha|depth|normal|distortion|surfels", help="what to show"
     )
     render.add_argument("--out", type=_picture, required=True, help="a .png, .jpg or .webp file")
+    animate = command("animate", _animate, "Render a motion of a finished hand.", job=True)
+    animate.add_argument("--poses", metavar="A;B;...", help="from pose to pose (default: a turn around rest)")
+    animate.add_argument("--camera", default="orbit:0,0", help="orbit:YAW,PITCH[,DISTANCE]")
+    animate.add_argument("--size", type=_size, default=(512, 512), metavar="WxH")
+    animate.add_argument("--fps", type=float, default=30.0)
+    animate.add_argument("--seconds", type=float, default=4.0, help="of a turn (default: 4)")
+    animate.add_argument("--out", type=_motion, required=True, help="a .mp4 or .webp file")
+    restart = command("restart", _restart, "Make a new job of a finished one's video.", job=True)
+    restart.add_argument(
+        "--option", "-o", type=_option, action="append", default=[], metavar="NAME=VALUE", help="to change"
+    )
+    restart.add_argument("--from-stage", help="begin here if there is a checkpoint")
+    restart.add_argument("--wait", "-w", action="store_true", help="follow the job to its end")
+    command("logs", _logs, "Show what the engine said.", job=True)
     download = command("download", _download, "Download the files of a finished job.", job=True)
     download.add_argument("name", nargs="?", help="one file (default: all)")
     download.add_argument("--out", type=Path, default=Path(), help="folder (default: here)")
     command("cancel", _cancel, "Stop a job.", job=True)
+    add_keys_parser(commands)
     command("delete", _delete, "Remove a job and everything of it.", job=True)
     return parser
 
@@ -288,6 +348,13 @@ def _picture(text: str) -> Path:
     path = Path(text)
     if path.suffix.lower() not in _FORMATS:
         raise argparse.ArgumentTypeError(f"{text!r} does not end in one of {', '.join(_FORMATS)}")
+    return path
+
+
+def _motion(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() not in (".mp4", ".webp"):
+        raise argparse.ArgumentTypeError(f"{text!r} does not end in .mp4 or .webp")
     return path
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import time
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,19 +16,15 @@ from urllib.parse import quote
 
 import httpx
 
+from service.errors import ServiceError
+from service.transfers import BytesProgress, upload
+
+__all__ = ["AssetInfo", "BytesProgress", "EventInfo", "JobError", "JobInfo", "MassClient", "ServiceError"]
+
 DEFAULT_URL = "http://127.0.0.1:8000"
-FINAL = frozenset({"succeeded", "failed", "cancelled"})
-
-#: Told how many bytes of how many have been sent or received.
-BytesProgress = Callable[[int, int], None]
-
-
-class ServiceError(Exception):
-    """The service refused or could not be reached: status (0: not reached), stable code, text, advice."""
-
-    def __init__(self, status: int, code: str, message: str, advice: str = "") -> None:
-        super().__init__(f"{message} {advice}".strip())
-        self.status, self.code, self.message, self.advice = status, code, message, advice
+#: How often a connection is tried again before it counts as lost.
+_RECONNECTS = 5
+FINAL = frozenset({"succeeded", "failed", "cancelled", "expired"})
 
 
 @dataclass(frozen=True)
@@ -67,6 +65,15 @@ class AssetInfo:
     sha256: str
 
 
+@dataclass(frozen=True)
+class EventInfo:
+    """One event of a job; ``id`` counts from 1 without gaps."""
+
+    id: int
+    kind: str
+    data: dict[str, Any]
+
+
 class MassClient:
     """Talks to one service. Every method raises ServiceError."""
 
@@ -75,8 +82,12 @@ class MassClient:
         url: str = DEFAULT_URL,
         timeout: float = 60.0,
         transport: httpx.BaseTransport | None = None,
+        key: str | None = None,
     ) -> None:
-        self._http = httpx.Client(base_url=url, timeout=timeout, transport=transport)
+        """``key``: for a service that asks for one (default: ``$MASS_KEY``)."""
+        key = key or os.environ.get("MASS_KEY")
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._http = httpx.Client(base_url=url, timeout=timeout, transport=transport, headers=headers)
 
     def __enter__(self) -> Self:
         return self
@@ -95,10 +106,24 @@ class MassClient:
         video: Path,
         options: Mapping[str, Any] | None = None,
         on_progress: BytesProgress | None = None,
+        *,
+        resumable: bool = True,
     ) -> JobInfo:
-        """Upload a video and create its job. Raises OSError when the file cannot be read."""
+        """Upload a video and create its job. Raises OSError when the file cannot be read.
+
+        ``resumable``: in parts, so that a broken connection costs one of them; otherwise as one form.
+        """
         with video.open("rb") as file:
-            stream: Any = file if on_progress is None else _Counted(file, video.stat().st_size, on_progress)
+            size = video.stat().st_size
+            if resumable:
+                wish = {
+                    "upload": upload(self._request, file, size, on_progress),
+                    "options": dict(options or {}),
+                }
+                # Sent again after an answer that was lost, the key makes no second job.
+                headers = {"Idempotency-Key": str(uuid.uuid4())}
+                return _job(self._insist("POST", "/jobs", json=wish, headers=headers).json())
+            stream: Any = file if on_progress is None else _Counted(file, size, on_progress)
             return _job(
                 self._request(
                     "POST",
@@ -108,6 +133,46 @@ class MassClient:
                     data={"options": json.dumps(dict(options))} if options else None,
                 ).json()
             )
+
+    def restart(
+        self, job_id: str, options: Mapping[str, Any] | None = None, from_stage: str | None = None
+    ) -> JobInfo:
+        """A new job of the same video."""
+        wish = {"options": dict(options or {}), "from_stage": from_stage}
+        headers = {"Idempotency-Key": str(uuid.uuid4())}
+        return _job(self._insist("POST", f"{_path(job_id)}/restart", json=wish, headers=headers).json())
+
+    def animate(self, job_id: str, motion: Mapping[str, Any], hand: str | None = None) -> JobInfo:
+        """A job that renders a motion of a finished hand; its file is ``motion.mp4`` or ``motion.webp``."""
+        headers = {"Idempotency-Key": str(uuid.uuid4())}
+        query = {} if hand is None else {"hand": hand}
+        path = f"{_path(job_id)}/renders"
+        return _job(self._insist("POST", path, json=dict(motion), headers=headers, params=query).json())
+
+    def events(self, job_id: str, after: int = 0) -> Iterator[EventInfo]:
+        """What happens to the job, from the event after ``after`` to its end. Connections that break are
+        taken up again where they broke; raises ServiceError when that fails, too."""
+        ended, failures = False, 0
+        while not ended:
+            before = after
+            try:
+                with self._http.stream(
+                    "GET", f"{_path(job_id)}/events", headers={"Last-Event-ID": str(after)}
+                ) as answer:
+                    if answer.is_error:
+                        answer.read()
+                        raise _refusal(answer)
+                    if answer.status_code == 204:
+                        return
+                    for event in _parse_events(answer.iter_lines()):
+                        after = event.id
+                        ended = event.data.get("state") in FINAL
+                        yield event
+            except httpx.HTTPError as error:
+                failures = 0 if after > before else failures + 1
+                if failures > _RECONNECTS:
+                    raise self._unreachable(error) from error
+                time.sleep(min(0.5 * failures, 5.0))
 
     def job(self, job_id: str) -> JobInfo:
         """The job as it is now."""
@@ -154,6 +219,18 @@ class MassClient:
             if on_update is not None:
                 on_update(job)
         return job
+
+    def logs(self, job_id: str) -> Iterator[str]:
+        """What the engine has said so far."""
+        after = 0
+        while True:
+            page = self._request(
+                "GET", f"{_path(job_id)}/logs", params={"after": after, "limit": 1000}
+            ).json()
+            yield from (line["text"] for line in page["lines"])
+            if not page["lines"]:
+                return
+            after = page["next"]
 
     def cancel(self, job_id: str) -> JobInfo:
         """Stop a queued or running job."""
@@ -227,6 +304,17 @@ class MassClient:
             part.unlink(missing_ok=True)
         return target
 
+    def _insist(self, method: str, path: str, **arguments: Any) -> httpx.Response:
+        """Ask again when no answer came. For requests that may safely arrive twice."""
+        for left in range(_RECONNECTS, -1, -1):
+            try:
+                return self._request(method, path, **arguments)
+            except ServiceError as error:
+                if error.status or not left:
+                    raise
+                time.sleep(0.5)
+        raise AssertionError("unreachable")
+
     def _request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         try:
             response = self._http.request(method, path, **arguments)
@@ -243,6 +331,19 @@ class MassClient:
             f"The service at {self._http.base_url} does not answer ({error or type(error).__name__}).",
             "Start it with `mass serve`, or name another with --url.",
         )
+
+
+def _parse_events(lines: Iterator[str]) -> Iterator[EventInfo]:
+    """Server-sent events, as far as this service uses the format."""
+    fields: dict[str, str] = {}
+    for line in lines:
+        name, _, value = line.partition(":")
+        if line:
+            fields[name] = value.removeprefix(" ")
+            continue
+        if "data" in fields and fields.get("id", "").isdecimal():
+            yield EventInfo(int(fields["id"]), fields.get("event", "message"), json.loads(fields["data"]))
+        fields = {}
 
 
 class _Counted:

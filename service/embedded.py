@@ -202,7 +202,11 @@ class EmbeddedBroker:
         self.socket.unlink(missing_ok=True)
         with self._log.open("wb") as output:
             self.process = launch(
-                self._command(), stdout=output, stderr=subprocess.STDOUT, death_signal=signal.SIGTERM
+                self._command(),
+                env={"PATH": os.environ.get("PATH", os.defpath)},  # it needs none of our secrets
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                death_signal=signal.SIGTERM,
             )
         self._started_at, self._restart_at = self._clock(), None
 

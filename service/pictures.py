@@ -41,6 +41,8 @@ class View:
     height: int
     format: PictureFormat
     channel: Channel = "rgb"
+    #: The folder of the hand in a result for both hands, else empty.
+    hand: str = ""
 
     @property
     def media_type(self) -> str:

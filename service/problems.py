@@ -20,7 +20,12 @@ MEDIA_TYPE = "application/problem+json"
 class Kind(Enum):
     """Every error the service answers with: code, status, title, advice. The codes are part of the API."""
 
-    REQUEST_MALFORMED = ("request.malformed", 400, "The request cannot be read", "Check the form encoding.")
+    REQUEST_MALFORMED = (
+        "request.malformed",
+        400,
+        "The request cannot be read",
+        "Check how the body is encoded.",
+    )
     REQUEST_HOST = (
         "request.host",
         403,
@@ -32,6 +37,30 @@ class Kind(Enum):
         403,
         "Another site's page sent this request",
         "Send changes from the service's own page or from a program.",
+    )
+    ACCESS_KEY = (
+        "access.key",
+        401,
+        "This needs a key",
+        "Send `Authorization: Bearer <key>`; `mass keys create` makes one.",
+    )
+    ACCESS_SCOPE = (
+        "access.scope",
+        403,
+        "The key does not allow this",
+        "Use a key with the scope that `detail` names.",
+    )
+    ACCESS_LINK = (
+        "access.link",
+        403,
+        "The link has run out or was changed",
+        "Ask for a new one with POST /jobs/{id}/links.",
+    )
+    QUOTA = (
+        "quota.exceeded",
+        429,
+        "You have as much as you may have",
+        "Wait the seconds in Retry-After, or delete finished jobs.",
     )
     NOT_FOUND = ("request.not_found", 404, "There is nothing at this path", "See /docs for the paths.")
     METHOD = (
@@ -45,6 +74,12 @@ class Kind(Enum):
         415,
         "The body is not a form",
         "Send multipart/form-data with the video in the field `video`.",
+    )
+    REQUEST_TOO_LARGE = (
+        "request.too_large",
+        413,
+        "The body is too long",
+        "Send less; only videos may be long, see POST /jobs and POST /uploads.",
     )
     REQUEST_INVALID = (
         "request.invalid",
@@ -60,6 +95,13 @@ class Kind(Enum):
         "Try again; if it stays, report it with the time of the request.",
     )
 
+    NOT_READY = (
+        "service.not_ready",
+        503,
+        "The service cannot do all of its work",
+        "See `errors` for the parts in trouble; jobs that were accepted are safe.",
+    )
+
     UPLOAD_INCOMPLETE = (
         "upload.incomplete",
         400,
@@ -69,14 +111,62 @@ class Kind(Enum):
     UPLOAD_STALLED = (
         "upload.stalled",
         408,
-        "The upload stopped sending",
-        "Send the file again over a better connection.",
+        "The request stopped in the middle",
+        "Send it again over a better connection.",
     )
     UPLOAD_TOO_LARGE = (
         "upload.too_large",
         413,
         "The upload is too large",
         "Send a shorter or smaller video; /capabilities names the limit.",
+    )
+    UPLOAD_NOT_FOUND = (
+        "upload.not_found",
+        404,
+        "There is no such upload",
+        "Begin a new one with POST /uploads; unfinished ones are kept until Upload-Expires.",
+    )
+    UPLOAD_VERSION = (
+        "upload.version",
+        412,
+        "This version of tus is not spoken here",
+        "Send the header `Tus-Resumable: 1.0.0`.",
+    )
+    UPLOAD_HEADERS = (
+        "upload.headers",
+        400,
+        "A header of the upload is missing or wrong",
+        "Correct the header that `detail` names; OPTIONS /uploads says what is offered.",
+    )
+    UPLOAD_MEDIA_TYPE = (
+        "upload.media_type",
+        415,
+        "The body is not part of an upload",
+        "Send it as application/offset+octet-stream.",
+    )
+    UPLOAD_OFFSET = (
+        "upload.offset",
+        409,
+        "That is not where the upload stands",
+        "Ask with HEAD for the Upload-Offset and go on from there.",
+    )
+    UPLOAD_LOCKED = (
+        "upload.locked",
+        423,
+        "Another request is writing to this upload",
+        "Try again after the seconds in Retry-After.",
+    )
+    UPLOAD_CHECKSUM = (
+        "upload.checksum",
+        460,
+        "The bytes do not match their checksum",
+        "Send this part again; nothing of it was kept.",
+    )
+    UPLOAD_USED = (
+        "upload.used",
+        409,
+        "A job has been made of this upload already",
+        "Use POST /jobs/{id}/restart to make another of the same video.",
     )
     STORAGE_FULL = (
         "storage.full",
@@ -126,7 +216,43 @@ class Kind(Enum):
         "job.finished",
         409,
         "The job is over already",
-        "Nothing to cancel; use DELETE to remove it.",
+        "There is nothing to cancel; DELETE removes it.",
+    )
+    JOB_UNFINISHED = (
+        "job.unfinished",
+        409,
+        "The job is not over yet",
+        "Cancel it first, or wait for its end.",
+    )
+    JOB_NO_VIDEO = (
+        "job.no_video",
+        409,
+        "The job's video is no longer here",
+        "Submit the video again.",
+    )
+    IDEMPOTENCY_IN_PROGRESS = (
+        "idempotency.in_progress",
+        409,
+        "The same request is being answered now",
+        "Wait for its answer, or send it again after the seconds in Retry-After.",
+    )
+    IDEMPOTENCY_MISMATCH = (
+        "idempotency.mismatch",
+        422,
+        "This Idempotency-Key came with another request before",
+        "Use a new key for each new request.",
+    )
+    PREVIEW_NONE = (
+        "preview.none",
+        404,
+        "There is no preview yet",
+        "The first one comes when the engine has begun to colour the hand.",
+    )
+    STREAMS = (
+        "events.too_many",
+        429,
+        "You have too many event streams open",
+        "Close one, or poll GET /jobs/{id} with If-None-Match.",
     )
     ASSET_NOT_FOUND = (
         "asset.not_found",
@@ -139,6 +265,14 @@ class Kind(Enum):
         416,
         "That range lies outside the file",
         "Ask for bytes within the size the asset list gives.",
+    )
+
+    WEBHOOK_NOT_FOUND = ("webhook.not_found", 404, "There is no such webhook", "GET /webhooks lists yours.")
+    WEBHOOK_URL = (
+        "webhook.url",
+        422,
+        "Nothing can be sent to this address",
+        "Use an https address that everybody can reach.",
     )
 
     POSE_INVALID = (
@@ -158,6 +292,12 @@ class Kind(Enum):
         422,
         "The picture would be too large",
         "Ask for fewer pixels; /capabilities names the limit.",
+    )
+    RENDER_NO_HAND = (
+        "render.no_hand",
+        404,
+        "The job has no such hand",
+        "Leave `hand` out, or submit the video with the option `side` set to `both`.",
     )
     RENDER_REFUSED = ("render.refused", 422, "The engine refused the request", "Change the pose or camera.")
     RENDER_FAILED = (
@@ -281,10 +421,25 @@ def declared(*kinds: Kind) -> dict[int | str, dict[str, Any]]:
     return {
         status: {
             "description": "; ".join(f"`{kind.code}`: {kind.title}" for kind in group),
-            "content": {MEDIA_TYPE: {"schema": schema}},
+            "content": {
+                MEDIA_TYPE: {"schema": schema, "examples": {kind.code: _example(kind) for kind in group}}
+            },
         }
         for status, group in sorted(by_status.items())
     }
+
+
+def _example(kind: Kind) -> dict[str, Any]:
+    body = ProblemBody(
+        type=f"/problems/{kind.code}",
+        title=kind.title,
+        status=kind.status,
+        detail=f"{kind.title}.",
+        instance="/the/path",
+        code=kind.code,
+        advice=kind.advice,
+    )
+    return {"summary": kind.title, "value": body.model_dump()}
 
 
 def field_errors(errors: Any) -> list[dict[str, str]]:
@@ -309,7 +464,13 @@ async def _on_problem(request: Request, error: Exception) -> ProblemResponse:
 
 async def _on_http(request: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, HTTPException)
-    kinds = {404: Kind.NOT_FOUND, 405: Kind.METHOD, 413: Kind.UPLOAD_TOO_LARGE, 500: Kind.INTERNAL}
+    kinds = {
+        400: Kind.REQUEST_MALFORMED,
+        404: Kind.NOT_FOUND,
+        405: Kind.METHOD,
+        413: Kind.UPLOAD_TOO_LARGE,
+        500: Kind.INTERNAL,
+    }
     kind = kinds.get(error.status_code, Kind.HTTP)
     headers = dict(error.headers or {})
     detail = "" if error.status_code in kinds else str(error.detail)

@@ -22,6 +22,7 @@ from typing import Self
 
 import httpx
 
+from service.access.gate import asks_for_keys
 from service.embedded import DataDirLock, EmbeddedBroker
 from service.processes import Backoff, launch, stop_group
 from service.pulse import is_fresh, pulse_path
@@ -165,8 +166,10 @@ def serve(settings: Settings, workers: int = 1) -> int:
                 raise ServeError(
                     f"The service was not ready within {_START_SECONDS:g} s.", "See its output above."
                 )
-        if settings.host not in ("127.0.0.1", "::1", "localhost"):
-            log.warning("anyone who can reach %s may use this service", settings.host)
+        if asks_for_keys(settings.auth, settings.host):
+            log.info("keys are asked for; `mass keys create OWNER` makes one")
+        elif asks_for_keys("auto", settings.host):
+            log.warning("anyone who can reach %s may use this service: MASS_AUTH is open", settings.host)
         print(
             f"MASS is ready on {_url(settings.host, port)} (data in {settings.data_dir}; Ctrl-C stops it)",
             flush=True,

@@ -9,14 +9,22 @@ from typing import Annotated, cast
 
 from fastapi import Depends, Request
 
-from service.jobs.model import Job, JobState, is_job_id
+from service.access.keys import Caller
+from service.access.links import Signer, service_secret
+from service.access.quotas import Quota
+from service.jobs.idempotency import IdempotencyKeys
+from service.jobs.model import FINAL_STATES, Job, JobKind, JobState, is_job_id
 from service.jobs.store import JobStore, create_store
+from service.metrics import Metrics
 from service.pictures import PictureCache
 from service.problems import Kind, ProblemError
 from service.queue import JobQueue, create_queue
 from service.rendering import Loader, RenderPool, create_pool
 from service.settings import Settings
 from service.storage import Storage, create_storage
+from service.tus.rows import UploadStore, create_uploads
+from service.watching import StreamSlots
+from service.webhooks.outbox import Outbox
 
 
 @dataclass(frozen=True)
@@ -25,26 +33,45 @@ class Services:
 
     settings: Settings
     store: JobStore
+    keys: IdempotencyKeys
+    uploads: UploadStore
     storage: Storage
     queue: JobQueue
     pool: RenderPool
     pictures: PictureCache
+    signer: Signer
+    streams: StreamSlots
+    outbox: Outbox
+    metrics: Metrics
 
-    def job(self, job_id: str) -> Job:
-        """The job. Raises ProblemError (404)."""
-        job = self.store.get(job_id) if is_job_id(job_id) else None
+    def job(self, job_id: str, caller: Caller) -> Job:
+        """The job, if the caller may see it. Raises ProblemError (404): others' jobs do not exist."""
+        job = self.store.get(job_id, caller.sees) if is_job_id(job_id) else None
         if job is None:
             raise ProblemError(Kind.JOB_NOT_FOUND)
         return job
 
-    def artifact(self, job_id: str) -> str:
+    def artifact(self, job_id: str, caller: Caller) -> str:
         """The name of the job's result directory. Raises ProblemError (404, 409)."""
-        job = self.job(job_id)
+        job = self.job(job_id, caller)
         if job.state == JobState.SUCCEEDED and job.artifact is not None:
             return job.artifact
-        if job.state in (JobState.FAILED, JobState.CANCELLED):
+        if job.state in FINAL_STATES:
             raise ProblemError(Kind.JOB_NO_RESULT, f"The job is {job.state}.")
         raise ProblemError(Kind.JOB_NOT_READY, f"The job is {job.state}.", headers={"Retry-After": "5"})
+
+    def avatar(self, job_id: str, caller: Caller) -> str:
+        """:meth:`artifact` of a job that made an avatar. Raises ProblemError (404, 409)."""
+        if self.job(job_id, caller).kind != JobKind.FIT:
+            raise ProblemError(Kind.JOB_NO_RESULT, "It made a motion, not a hand; see its assets.")
+        return self.artifact(job_id, caller)
+
+    def quota(self, caller: Caller) -> Quota:
+        """What the caller may have."""
+        chosen = self.settings
+        return (
+            Quota(chosen.quota_jobs, chosen.quota_bytes, chosen.quota_minutes) if caller.limited else Quota()
+        )
 
 
 @contextmanager
@@ -59,7 +86,21 @@ def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
         pool = create_pool(settings, loader)
         stack.callback(pool.close)
         pool.start()
-        yield Services(settings, store, storage, queue, pool, PictureCache(settings.render_cache_bytes))
+        signer = Signer(service_secret(settings.secret.get_secret_value(), settings.data_dir))
+        yield Services(
+            settings=settings,
+            store=store,
+            keys=IdempotencyKeys(store.engine),
+            uploads=create_uploads(settings, store.engine),
+            storage=storage,
+            queue=queue,
+            pool=pool,
+            pictures=PictureCache(settings.render_cache_bytes),
+            signer=signer,
+            streams=StreamSlots(settings.max_streams),
+            outbox=Outbox(store.engine),
+            metrics=Metrics(store),
+        )
 
 
 async def _services(request: Request) -> Services:

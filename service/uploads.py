@@ -7,6 +7,7 @@ writes the video straight to where it stays, looks at its first bytes, and stops
 from __future__ import annotations
 
 import errno
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -41,6 +42,7 @@ class ReceivedForm:
 
     options: JobOptions
     video_bytes: int
+    video_sha256: str
 
 
 def container(head: bytes) -> str | None:
@@ -89,8 +91,7 @@ async def receive_form(
 
 def refuse_early(request: Request, storage: Storage, max_video_bytes: int) -> None:
     """Refuse, before a byte is read, what its headers show to be hopeless. Raises ProblemError."""
-    declared = request.headers.get("content-length", "")
-    length = int(declared) if declared.isdecimal() else 0
+    length = declared_length(request)
     if length > max_video_bytes + FORM_OVERHEAD:
         detail = f"The body is said to have {length} bytes; a video may have {max_video_bytes}."
         problem = ProblemError(Kind.UPLOAD_TOO_LARGE, detail)
@@ -100,6 +101,17 @@ def refuse_early(request: Request, storage: Storage, max_video_bytes: int) -> No
         return
     problem.unread = True
     raise problem
+
+
+def media_type(request: Request) -> str:
+    """The media type of the body, without its parameters."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+def declared_length(request: Request) -> int:
+    """Bytes of the body as its header says; 0 when it does not."""
+    declared = request.headers.get("content-length", "")
+    return int(declared) if declared.isdecimal() else 0
 
 
 class _Form:
@@ -114,6 +126,7 @@ class _Form:
         self._limit = max_video_bytes
         self._file = target.open("wb")
         self._head = b""
+        self._digest = hashlib.sha256()
         self._video_bytes: int | None = None
         self._options: bytearray | None = None
         self._received = 0
@@ -168,7 +181,7 @@ class _Form:
             raise ProblemError(Kind.UPLOAD_INCOMPLETE, "The form ends before its closing boundary.")
         if self._video_bytes is None:
             raise ProblemError(Kind.VIDEO_MISSING)
-        return ReceivedForm(self._parsed_options(), self._video_bytes)
+        return ReceivedForm(self._parsed_options(), self._video_bytes, self._digest.hexdigest())
 
     def close(self) -> None:
         """Close the file."""
@@ -224,7 +237,9 @@ class _Form:
             self._head += data[start : min(end, start + _SNIFF)]
             if len(self._head) >= _SNIFF:
                 self._check_container()
-        self._file.write(memoryview(data)[start:end])
+        part = memoryview(data)[start:end]
+        self._digest.update(part)
+        self._file.write(part)
 
     def _part_end(self) -> None:
         if self._field == "video":

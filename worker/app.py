@@ -34,20 +34,24 @@ _LOOK_SECONDS = 0.2
 
 
 def create_app(settings: Settings, supervisor: Supervisor) -> Celery:
-    """The consuming end of the queue, with the task and the sign of life.
+    """The consuming end of the queues, with the task and the sign of life.
 
     Messages are taken for good, not held until acknowledged. The row and its lease already bring back what a
     dying worker had; an unacknowledged message would add nothing but a copy to be delivered hours later, and
     a way to get stuck: when the broker restarts during a job, the acknowledgement fails, is not repeated, and
-    the full prefetch window keeps the worker from ever asking for another job.
+    the full prefetch window keeps the worker from ever asking for another job. So there are no late
+    acknowledgements, and no visibility timeout to tune: nothing is ever waiting to be restored.
     """
     app = create_celery(settings)
     app.conf.update(
-        task_queues=(Queue(settings.queue_name, no_ack=True),),  # type: ignore[no-untyped-call]
-        task_acks_late=False,
+        task_queues=tuple(Queue(name, no_ack=True) for name in settings.worker_queues),  # type: ignore[no-untyped-call]
         worker_disable_prefetch=True,  # ask for a job only when there is a thread for it
+        worker_prefetch_multiplier=1,
+        worker_concurrency=1,
         worker_pool="threads",
-        worker_max_tasks_per_child=None,
+        # A running job is finished when the broker goes away; it needs no broker.
+        worker_cancel_long_running_tasks_on_connection_loss=False,
+        worker_send_task_events=False,
         worker_enable_remote_control=False,  # jobs are cancelled through their row
         worker_hijack_root_logger=False,
         worker_redirect_stdouts=False,
@@ -74,7 +78,7 @@ def run_worker(settings: Settings) -> int:
     worker = app.Worker(
         concurrency=1,
         pool="threads",
-        queues=[settings.queue_name],
+        queues=list(settings.worker_queues),
         without_mingle=True,
         without_gossip=True,
         without_heartbeat=True,

@@ -1,4 +1,4 @@
-"""The engine as a child process: its command line, its environment, its events, its end."""
+"""The engine as a child process: its command line, its events, its end."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import math
-import os
 import signal
 import subprocess
 import threading
@@ -28,20 +27,13 @@ FLAGS: dict[str, str] = {
     "fov": "--fov",
     "max_frames": "--max-frames",
     "holdout": "--holdout",
+    "device": "--device",
 }
 
-#: All that the engine sees of our environment; passwords and URLs of the service are not in it.
-_ENVIRONMENT = frozenset(
-    {
-        *("PATH", "HOME", "LANG", "LC_ALL", "LC_CTYPE", "TZ", "TMPDIR", "XDG_CACHE_HOME", "MASS_MODEL_DIR"),
-        *("OMP_NUM_THREADS", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "SYSTEMROOT"),
-        *("CUDA_VISIBLE_DEVICES", "NVIDIA_VISIBLE_DEVICES", "NVIDIA_DRIVER_CAPABILITIES"),
-    }
-)
-
-_LIMITS = {"core": 0, "nofile": 4096, "fsize": 16 * 1024**3}
 _MAX_LINE = 64 * 1024
 _TAIL_LINES = 40
+_UNREAD_LINES = 500
+_MAX_WARNINGS = 100
 
 
 @dataclass(frozen=True)
@@ -68,39 +60,59 @@ class UnknownOptionError(ValueError):
 
 
 def fit_command(
-    engine: Sequence[str], video: Path, run: Path, options: Mapping[str, str | int | float | None]
+    engine: Sequence[str],
+    video: Path,
+    run: Path,
+    options: Mapping[str, str | int | float | None],
+    *,
+    resume: bool = False,
+    from_stage: str | None = None,
+    max_seconds: float | None = None,
 ) -> list[str]:
-    """The command that fits ``video`` into the directory ``run``. Raises UnknownOptionError."""
+    """The command that fits ``video`` into the directory ``run``, or goes on with what lies there already.
+
+    ``from_stage``: of what lies there, only what came before this stage counts. A video longer than
+    ``max_seconds`` is to be refused. Raises UnknownOptionError.
+    """
     unknown = sorted(set(options) - set(FLAGS))
     if unknown:
         raise UnknownOptionError(f"unknown option {unknown[0]!r}")
     # One word per option, so that no value can be taken for a flag.
     flags = [f"{FLAGS[name]}={value}" for name, value in options.items() if value is not None]
+    if max_seconds is not None:
+        flags.append(f"--max-seconds={max_seconds:g}")
+    if resume:
+        flags.append("--resume")
+        if from_stage is not None:
+            flags.append(f"--from-stage={from_stage}")
     return [*engine, "fit", str(video), "--out", str(run), "--json", *flags]
 
 
-def engine_environment(source: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment of the engine: the harmless part of ours, and what makes its output prompt."""
-    ours = os.environ if source is None else source
-    kept = {name: value for name, value in ours.items() if name in _ENVIRONMENT}
-    return {**kept, "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
+def animate_command(
+    engine: Sequence[str], avatar: Path, run: Path, motion: Mapping[str, object]
+) -> list[str]:
+    """The command that renders a motion of ``avatar`` into the directory ``run``."""
+    spec = run / "motion.json"
+    spec.write_text(json.dumps(motion))
+    return [*engine, "animate", str(avatar), "--motion", str(spec), "--out", str(run), "--json"]
 
 
 class EngineProcess:
     """One run. Start it from the thread that stays until it ends; always call :meth:`stop` at the end."""
 
-    def __init__(self, command: Sequence[str]) -> None:
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
         self.progress: EngineProgress | None = None
         self.failure: EngineFailure | None = None
+        self.warnings: list[dict[str, str]] = []
         self._tail: deque[str] = deque(maxlen=_TAIL_LINES)
+        self._said: deque[str] = deque(maxlen=_UNREAD_LINES)
         self._closed = threading.Event()
         self._process = launch(
             command,
-            env=engine_environment(),
+            env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             death_signal=signal.SIGKILL,
-            limits=_LIMITS,
         )
         assert self._process.stdout is not None
         assert self._process.stderr is not None
@@ -120,6 +132,14 @@ class EngineProcess:
     def tail(self) -> str:
         """The last lines it wrote that were no events."""
         return "\n".join(self._tail)
+
+    def new_lines(self) -> list[str]:
+        """What it said to the job's owner since the last call: stages, warnings, its error."""
+        lines = []
+        with contextlib.suppress(IndexError):
+            while True:
+                lines.append(self._said.popleft())
+        return lines
 
     def wait(self, seconds: float) -> int | None:
         """The exit code, negative for a signal, or None while it runs; returns early when it ends."""
@@ -150,13 +170,21 @@ class EngineProcess:
         event = _parse(line)
         kind = event.get("type")
         if kind == "progress":
-            self.progress = _progress(event)
+            before, self.progress = self.progress, _progress(event)
+            if before is None or before.stage != self.progress.stage:
+                self._said.append(f"stage {self.progress.stage}")
         elif kind == "error":
             self.failure = EngineFailure(
                 _text(event, "code", 80), _text(event, "message", 1000), _text(event, "advice", 1000)
             )
+            self._said.append(f"error {self.failure.code}: {self.failure.message}")
         elif kind == "warning":
-            log.info("engine %d warns: %s %s", self.pid, event.get("code"), event.get("message"))
+            warning = {key: _text(event, key, 900) for key in ("code", "message", "advice")}
+            if len(self.warnings) < _MAX_WARNINGS and warning not in self.warnings:
+                self.warnings = [*self.warnings, warning]
+            # Its words are for the job's owner, and go when the job goes; the log stays.
+            log.info("engine %d warns: %s", self.pid, warning["code"][:80])
+            self._said.append(f"warning {_text(event, 'code', 80)}: {_text(event, 'message', 900)}")
         elif kind != "done":
             self._tail.append(line.decode(errors="replace").rstrip()[:500])
 

@@ -1,7 +1,7 @@
 """One job from claim to end: start the engine, keep the lease, pass on progress, obey, and write the result.
 
 Every write carries the fencing token of the claim. When the lease is lost, whoever has it now decides what
-the job becomes: this worker stops its engine, removes its own output and writes nothing.
+the job becomes: this worker stops its engine and writes nothing.
 """
 
 from __future__ import annotations
@@ -17,11 +17,15 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.jobs.housekeeping import purge_deleted
-from service.jobs.store import Claim, Heartbeat, JobStore
+from service.jobs.model import FINAL_STATES, JobKind
+from service.jobs.store import LOST_ADVICE, Claim, Heartbeat, JobStore
+from service.logs import about, trace_of
 from service.queue import JobQueue
 from service.settings import Settings
-from service.storage import Storage
-from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, fit_command
+from service.storage import Storage, missing_outputs
+from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, animate_command, fit_command
+from worker.run_directory import CHECKPOINT, drop_checkpoint, has_checkpoint, prepare
+from worker.sandbox import Sandbox
 
 log = logging.getLogger(__name__)
 
@@ -32,9 +36,6 @@ _CANCEL_SECONDS = 1.0
 _CANCEL_GRACE = 2.0
 _SHUTDOWN_GRACE = 5.0
 
-#: Without these an exit code of 0 is not believed.
-OUTPUTS = ("avatar.safetensors", "report.json", "surfels.ply")
-
 _EXIT_BAD_ARGUMENTS = 2
 _EXIT_BAD_INPUT = 3
 
@@ -42,7 +43,7 @@ _EXIT_BAD_INPUT = 3
 class Outcome(StrEnum):
     """How a worker's dealing with one message ended."""
 
-    REFUSED = "refused"  # the worker is stopping: the message was passed on
+    REFUSED = "refused"  # the worker is stopping, or its disk full: the job is left to others
     SKIPPED = "skipped"  # nothing to do: somebody else has the job, or it is over
     SUCCEEDED = "succeeded"
     FAILED = "failed"
@@ -115,18 +116,29 @@ class Supervisor:
         self._settings, self._store, self._storage, self._queue = settings, store, storage, queue
         self._stopping = stopping
         self._clock = clock
+        self._sandbox = Sandbox(settings)
 
     def run(self, job_id: str) -> Outcome:
         """Do the job if it can be claimed. Raises only when the database cannot be reached."""
         if self._stopping.is_set():
-            self._queue.publish(job_id)
+            job = self._store.get(job_id)
+            if job is not None:
+                self._queue.publish(job_id, job.queue)
+            return Outcome.REFUSED
+        if not self._storage.has_room():
+            # The row stays queued; the reconciler asks again after a pause, here or on a machine with room.
+            log.error("job %s: not started, the disk is full", job_id)
             return Outcome.REFUSED
         since = self._clock()
         claim = self._store.claim(job_id, lease_seconds=self._settings.lease_seconds)
         if claim is None:
             return Outcome.SKIPPED
+        with about(job=job_id, trace=trace_of(claim.traceparent)):
+            return self._do(claim, Lease(self._store, claim, self._settings, since, self._clock))
+
+    def _do(self, claim: Claim, lease: Lease) -> Outcome:
+        job_id = claim.job_id
         log.info("job %s: attempt %d starts", job_id, claim.attempt)
-        lease = Lease(self._store, claim, self._settings, since, self._clock)
         try:
             outcome = self._work(claim, lease)
         except SQLAlchemyError:
@@ -135,30 +147,65 @@ class Supervisor:
             outcome = Outcome.LOST
         except Exception:
             log.exception("job %s: the worker failed", job_id)
-            outcome = self._again(claim, "worker.failed", "The worker could not run the engine.")
+            outcome = self._broken(claim, "worker.failed", "The worker could not run the engine.")
         log.info("job %s: attempt %d %s", job_id, claim.attempt, outcome)
-        if outcome is not Outcome.SUCCEEDED:
-            shutil.rmtree(self._storage.artifact_path(job_id, claim.artifact), ignore_errors=True)
-        if outcome is Outcome.CANCELLED:
-            purge_deleted(self._store, self._storage)  # DELETE of a running job ends as a cancellation
+        try:
+            self._tidy(claim, outcome)
+        except (OSError, SQLAlchemyError) as error:
+            log.warning("job %s: leftovers remain for now (%s)", job_id, error)
         return outcome
 
+    def _tidy(self, claim: Claim, outcome: Outcome) -> None:
+        """Remove the directories nobody needs: a checkpoint is kept for the next attempt or a restart."""
+        run = self._storage.artifact_path(claim.job_id, claim.artifact)
+        if outcome is Outcome.SUCCEEDED:
+            self._storage.drop_attempts(claim.job_id, keep=claim.artifact)
+        elif outcome is Outcome.LOST:
+            # Whoever has the job now may be taking this directory over; it goes once the job is over.
+            job = self._store.get(claim.job_id)
+            if job is None:
+                self._storage.delete_job(claim.job_id)
+            elif job.state in FINAL_STATES or not self._storage.has_room():
+                shutil.rmtree(run, ignore_errors=True)
+        elif not has_checkpoint(run):
+            shutil.rmtree(run, ignore_errors=True)
+            self._storage.drop_checkpoint(claim.job_id)
+        elif outcome is not Outcome.RELEASED:
+            self._storage.save_checkpoint(claim.job_id, run / CHECKPOINT)  # for a restart
+        if outcome is Outcome.CANCELLED:
+            purge_deleted(self._store, self._storage)  # DELETE of a running job ends as a cancellation
+
     def _work(self, claim: Claim, lease: Lease) -> Outcome:
-        # What earlier attempts left is of no use to this one, and nobody else may publish it any more.
-        self._storage.drop_attempts(claim.job_id)
-        run = self._storage.attempt_dir(claim.job_id, claim.artifact)
-        video = self._storage.source(claim.video)
+        run, resumed = prepare(self._storage, claim)
+        video = self._storage.fetch_source(claim.video, run)
         try:
-            command = fit_command(self._settings.engine, video, run, claim.options)
+            if claim.kind == JobKind.RENDER:
+                command = animate_command(self._settings.engine, video, run, claim.options)
+            else:
+                command = fit_command(
+                    self._settings.engine,
+                    video,
+                    run,
+                    claim.options,
+                    resume=resumed,
+                    from_stage=claim.from_stage,
+                    max_seconds=self._settings.max_video_seconds,
+                )
         except UnknownOptionError as error:
             return self._fail(claim, "options.invalid", f"The job has an {error}.", "Submit it without.")
-        engine = EngineProcess(command)
+        self._sandbox.open(run, video)
+        environment = self._sandbox.environment(run)
+        if claim.traceparent is not None:
+            environment["TRACEPARENT"] = claim.traceparent
+        engine = EngineProcess(self._sandbox.command(command, run, video), environment)
         grace = 0.0
         try:
             stop = self._watch(claim, lease, engine)
             grace = {_Stop.CANCEL: _CANCEL_GRACE, _Stop.SHUTDOWN: _SHUTDOWN_GRACE}.get(stop, 0.0)
         finally:
             code = engine.stop(grace)
+            self._sandbox.close(run)
+            self._pass_on(claim, engine)
         match stop:
             case _Stop.LOST:
                 return Outcome.LOST
@@ -174,7 +221,13 @@ class Supervisor:
                     "Submit a shorter clip, or a lower preset.",
                 )
             case _Stop.EXITED:
-                return self._conclude(claim, lease, engine, code, run)
+                if resumed and (code != 0 or missing_outputs(run, claim.kind)):
+                    # It may be the checkpoint that breaks the engine: the next attempt begins anew.
+                    drop_checkpoint(run)
+                outcome = self._conclude(claim, lease, engine, code, run)
+                if outcome is Outcome.FAILED:
+                    drop_checkpoint(run)
+                return outcome
 
     def _watch(self, claim: Claim, lease: Lease, engine: EngineProcess) -> _Stop:
         deadline = self._clock() + self._settings.job_timeout
@@ -187,6 +240,7 @@ class Supervisor:
             answer = lease.check()
             if answer is not Heartbeat.OK:
                 return _Stop.CANCEL if answer is Heartbeat.CANCEL else _Stop.LOST
+            self._pass_on(claim, engine)
             if engine.progress is not shown:
                 shown = engine.progress
                 self._show(claim, engine.progress)
@@ -208,10 +262,21 @@ class Supervisor:
             # Progress may be missed; the lease decides how long to go on without a database.
             log.warning("job %s: progress not written (%s)", claim.job_id, type(error).__name__)
 
+    def _pass_on(self, claim: Claim, engine: EngineProcess) -> None:
+        """Give the job's owner what the engine said."""
+        lines = engine.new_lines()
+        if lines:
+            try:
+                self._store.log(claim.job_id, claim.token, lines)
+                if engine.warnings:
+                    self._store.report_warnings(claim.job_id, claim.token, engine.warnings)
+            except SQLAlchemyError as error:
+                log.warning("job %s: log not written (%s)", claim.job_id, type(error).__name__)
+
     def _conclude(self, claim: Claim, lease: Lease, engine: EngineProcess, code: int, run: Path) -> Outcome:
         said = engine.failure
         if code == 0:
-            missing = [name for name in OUTPUTS if not (run / name).is_file()]
+            missing = missing_outputs(run, claim.kind)
             if not missing:
                 return self._succeed(claim, lease)
             log.error("job %s: the engine left no %s", claim.job_id, ", ".join(missing))
@@ -229,7 +294,7 @@ class Supervisor:
             return outcome
         else:
             log.error("job %s: the engine ended with %d: %s", claim.job_id, code, engine.tail)
-        return self._again(claim, "engine.crashed", f"The engine stopped unexpectedly ({_describe(code)}).")
+        return self._broken(claim, "engine.crashed", f"The engine stopped unexpectedly ({_describe(code)}).")
 
     def _succeed(self, claim: Claim, lease: Lease) -> Outcome:
         answer = lease.renew()  # making the files durable takes a while
@@ -247,20 +312,39 @@ class Supervisor:
         ended = self._store.fail(claim.job_id, claim.token, code, message, advice)
         return Outcome.FAILED if ended else Outcome.LOST
 
-    def _again(self, claim: Claim, code: str, message: str) -> Outcome:
+    def _broken(self, claim: Claim, code: str, message: str) -> Outcome:
         """Another attempt, or the end when this was the last one."""
+        full = not self._storage.has_room()
+        if full:
+            # At once: the database may need the room to write down what happened.
+            shutil.rmtree(self._storage.artifact_path(claim.job_id, claim.artifact), ignore_errors=True)
         if claim.attempt < self._settings.max_attempts:
             return self._release(claim, refund=False)
-        advice = "Submit the video again; if it fails the same way, try a shorter or smaller clip."
+        advice = LOST_ADVICE
+        if full:
+            code, message = "storage.full", "The disk of the worker filled up."
+            advice = "Try again later, with a shorter clip; whoever runs the service should make room."
         return self._fail(claim, code, f"{message} It was tried {claim.attempt} times.", advice)
 
     def _release(self, claim: Claim, *, refund: bool) -> Outcome:
+        self._save(claim)
         if not self._store.release(claim.job_id, claim.token, refund=refund):
             return Outcome.LOST
         # The row is queued and due: should the broker be away, a reconciler sends the message.
-        if self._queue.publish(claim.job_id):
+        if self._queue.publish(claim.job_id, claim.queue):
             self._store.mark_published(claim.job_id)
         return Outcome.RELEASED
+
+    def _save(self, claim: Claim) -> None:
+        """Before anyone else may start: let whoever does find the checkpoint, or none."""
+        run = self._storage.artifact_path(claim.job_id, claim.artifact)
+        try:
+            if has_checkpoint(run):
+                self._storage.save_checkpoint(claim.job_id, run / CHECKPOINT)
+            else:
+                self._storage.drop_checkpoint(claim.job_id)
+        except OSError as error:
+            log.warning("job %s: its checkpoint was not saved (%s)", claim.job_id, error)
 
 
 def _describe(code: int) -> str:

@@ -22,7 +22,6 @@ from mass_engine.fitting.subject import Appearance, Shape
 from mass_engine.fitting.views import View
 from mass_engine.surfel.binding import MeshBinding
 
-FILE_NAME = "checkpoint.safetensors"
 _APPEARANCE = ("albedo", "opacity_logits", "sh", "light")
 _EVIDENCE = ("hand", "ignored", "background", "albedo")
 

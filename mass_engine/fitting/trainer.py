@@ -17,6 +17,7 @@ from mass_engine.fitting.conversion import convert, deform_surfels, finish
 from mass_engine.fitting.evidence import Evidence, Scene, colors_of, fill_unseen, gather, spread
 from mass_engine.fitting.gauss_newton import Registrar, Round
 from mass_engine.fitting.geometry import GeometryFit, GeometryPass
+from mass_engine.fitting.looks import Looks, Show
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.schedule import SWEEP, Schedule
 from mass_engine.fitting.skin import Skin
@@ -68,6 +69,7 @@ class Trainer:
     components: Components
     seed: int
     start: HandPose
+    show: Show | None = None
     _bindings: dict[tuple[int, int, bool], MeshBinding] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -226,7 +228,11 @@ class Trainer:
     def _appearance(self, part: SurfelPass, number: int, progress: Progressed) -> None:
         fitter = self._fitter()
         skin, appearance = self.state.surfels()
-        result = fitter.run(skin, appearance, part, self.seed * 1009 + number + 1, progress)
+        best = _best_frame(self.views)
+        row = next(row for row, view in enumerate(self.views) if view.index == best)
+        looks = Looks(self.scene, row, skin, appearance, self.show)
+        seed = self.seed * 1009 + number + 1
+        result = fitter.run(skin, appearance, part, seed, looks.beside(progress))
         self._count(fitter.undone)
         self.state.notes.setdefault("stage_two", []).append(result.summary(part.side))
 
@@ -261,8 +267,11 @@ def fit_hand(
     progress: Callable[[float, str], None],
     components: Components | None = None,
     checkpoint: Path | None = None,
+    show: Show | None = None,
 ) -> FitResult:
     """Fit one hand to ``views`` (in time order) from the poses ``start`` [F] with one shape.
+
+    ``show`` gets a look at the hand now and then during stage two; the fit is the same with or without it.
 
     Held-out views give only their silhouette and landmarks, only to their own pose, and only after
     everything else is finished. With a ``checkpoint`` file every step is saved there; if the file holds
@@ -276,7 +285,7 @@ def fit_hand(
     state = FitState(
         PoseTable(start), Shape.mean(model, start.betas[0]), white_light(), torch.ones(len(views), 3)
     )
-    trainer = Trainer(views, state, camera, schedule, components, seed, start)
+    trainer = Trainer(views, state, camera, schedule, components, seed, start, show)
     state.notes["start_jitter_radians"] = round(noise, 4)
     with one_thread():  # thousands of small operators; the rasteriser has threads of its own
         trainer.run(progress, checkpoint)

@@ -9,32 +9,49 @@ import uuid
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import JSON, Enum, Index, String, Text
+from sqlalchemy import JSON, BigInteger, Enum, Index, String, Text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 
-class JobState(StrEnum):
-    """Where a job stands. Later: awaiting_upload and cancelling before the end, expired at the end."""
+class JobKind(StrEnum):
+    """What a job makes: an avatar of a video, or a motion of an avatar."""
 
+    FIT = "fit"
+    RENDER = "render"
+
+
+class JobState(StrEnum):
+    """Where a job stands."""
+
+    AWAITING_UPLOAD = "awaiting_upload"
     QUEUED = "queued"
     RUNNING = "running"
+    CANCELLING = "cancelling"
     SUCCEEDED = "succeeded"
     FAILED = "failed"
     CANCELLED = "cancelled"
+    EXPIRED = "expired"
 
 
-#: The one table of allowed moves. ``running -> running`` is a second worker taking over an expired lease.
+_S = JobState
+
+#: The one table of allowed moves. ``running -> running`` is a second worker taking over an expired lease;
+#: ``running -> queued`` a job given back or taken back from a silent worker. A job being cancelled ends as
+#: cancelled whatever its worker still has to say. Only a job whose video never came expires.
 TRANSITIONS: dict[JobState, frozenset[JobState]] = {
-    JobState.QUEUED: frozenset({JobState.RUNNING, JobState.CANCELLED}),
-    JobState.RUNNING: frozenset(
-        {JobState.RUNNING, JobState.QUEUED, JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED}
-    ),
-    JobState.SUCCEEDED: frozenset(),
-    JobState.FAILED: frozenset(),
-    JobState.CANCELLED: frozenset(),
+    _S.AWAITING_UPLOAD: frozenset({_S.QUEUED, _S.CANCELLED, _S.FAILED, _S.EXPIRED}),
+    _S.QUEUED: frozenset({_S.RUNNING, _S.CANCELLED}),
+    _S.RUNNING: frozenset({_S.RUNNING, _S.QUEUED, _S.CANCELLING, _S.SUCCEEDED, _S.FAILED}),
+    _S.CANCELLING: frozenset({_S.CANCELLED}),
+    _S.SUCCEEDED: frozenset(),
+    _S.FAILED: frozenset(),
+    _S.CANCELLED: frozenset(),
+    _S.EXPIRED: frozenset(),
 }
 
 FINAL_STATES: frozenset[JobState] = frozenset(state for state, after in TRANSITIONS.items() if not after)
+#: The states in which a worker has (or had) the job.
+HELD_STATES: frozenset[JobState] = frozenset({_S.RUNNING, _S.CANCELLING})
 
 
 def sources(target: JobState) -> frozenset[JobState]:
@@ -59,6 +76,10 @@ def is_job_id(text: str) -> bool:
     return _JOB_ID.fullmatch(text) is not None
 
 
+#: The owner of everything where no key is asked for.
+LOCAL = "local"
+
+
 class Base(DeclarativeBase):
     """The declarative base of every table."""
 
@@ -76,30 +97,51 @@ class Job(Base):
     __table_args__ = (
         Index("ix_jobs_state_lease", "state", "lease_until"),
         Index("ix_jobs_state_publish", "state", "publish_due_at"),
+        Index("ix_jobs_owner", "owner", "id"),
+        Index("ix_jobs_parent", "parent"),
     )
 
     id: Mapped[str] = mapped_column(String(36), primary_key=True)
+    #: Whose job it is: the name of an API key's owner, or :data:`LOCAL` where the service is open.
+    owner: Mapped[str] = mapped_column(String(64), default=LOCAL)
+    kind: Mapped[str] = mapped_column(String(20), default=JobKind.FIT)
+    #: Of a render: the job whose avatar moves.
+    parent: Mapped[str | None] = mapped_column(String(36), default=None)
     state: Mapped[JobState] = mapped_column(_STATE, default=JobState.QUEUED)
     #: What the engine does now and how far the whole job is (0 to 1, never falling within one attempt).
     stage: Mapped[str | None] = mapped_column(String(40), default=None)
+    stage_since: Mapped[float | None] = mapped_column(default=None)
     fraction: Mapped[float] = mapped_column(default=0.0)
     time_left: Mapped[float | None] = mapped_column(default=None)
     message: Mapped[str] = mapped_column(Text, default="")
 
     options: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
-    #: The uploaded video, relative to the data directory; no name chosen by a client appears in it.
+    #: Which workers may take it: ``cpu`` or ``gpu``.
+    queue: Mapped[str] = mapped_column(String(20), default="cpu", server_default="cpu")
+    #: The uploaded video (of a render: the avatar), relative to the data directory; no name chosen by a
+    #: client appears in it.
     video: Mapped[str] = mapped_column(String(200))
-    video_bytes: Mapped[int | None] = mapped_column(default=None)
+    video_bytes: Mapped[int | None] = mapped_column(BigInteger, default=None)
 
+    #: What the engine found worth a word: ``code``, ``message`` and ``advice`` of each, of this attempt.
+    warnings: Mapped[list[dict[str, str]]] = mapped_column(JSON, default=list)
     error_code: Mapped[str | None] = mapped_column(String(80), default=None)
     error_message: Mapped[str | None] = mapped_column(Text, default=None)
     error_advice: Mapped[str | None] = mapped_column(Text, default=None)
+
+    #: The job this one repeats, and the stage to begin at where that job's checkpoints allow it.
+    restarted_from: Mapped[str | None] = mapped_column(String(36), default=None)
+    from_stage: Mapped[str | None] = mapped_column(String(40), default=None)
+    #: W3C trace context of the request that made the job, for the worker to carry on.
+    traceparent: Mapped[str | None] = mapped_column(String(55), default=None)
 
     #: The lease: who works on it (a fencing token, new for each claim), which try it is, until when.
     attempt: Mapped[int] = mapped_column(default=0)
     token: Mapped[str | None] = mapped_column(String(32), default=None)
     lease_until: Mapped[float | None] = mapped_column(default=None)
-    cancel_requested: Mapped[bool] = mapped_column(default=False)
+    claimed_at: Mapped[float | None] = mapped_column(default=None)
+    #: Seconds that workers have spent on it, over all attempts that have ended.
+    busy_seconds: Mapped[float] = mapped_column(default=0.0)
     #: Set by DELETE: the job is invisible from then on, its bytes go as soon as no worker holds it.
     deleted_at: Mapped[float | None] = mapped_column(default=None)
 
@@ -107,10 +149,22 @@ class Job(Base):
     started_at: Mapped[float | None] = mapped_column(default=None)
     finished_at: Mapped[float | None] = mapped_column(default=None)
 
+    #: When retention removed its video, and its checkpoint (service/jobs/retention.py).
+    video_dropped_at: Mapped[float | None] = mapped_column(default=None)
+    checkpoint_dropped_at: Mapped[float | None] = mapped_column(default=None)
+
     #: Outbox: when the wake-up message was last sent, how often, and when it is due again.
     last_published_at: Mapped[float | None] = mapped_column(default=None)
     publish_attempts: Mapped[int] = mapped_column(default=0)
     publish_due_at: Mapped[float] = mapped_column(default=0.0)
 
+    #: Number of the newest entry of the job's journal (service/jobs/journal.py).
+    event_seq: Mapped[int] = mapped_column(default=0)
+
     #: Name of the published artifact directory (``<attempt>-<token>``), set only on success.
     artifact: Mapped[str | None] = mapped_column(String(60), default=None)
+
+    @property
+    def cancel_requested(self) -> bool:
+        """Whether its worker has been told to stop."""
+        return self.state == JobState.CANCELLING

@@ -1,39 +1,48 @@
-"""The job table and every way to change it.
-
-Each change of state is one atomic ``UPDATE ... WHERE`` that names the states it may leave (from the table
-in model.py) and, for a worker, the fencing token of its claim. Whoever lost the job changes nothing and is
-told so.
-"""
+"""What users, workers and the reconciler may do with jobs. How a state changes is table.py's business."""
 
 from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ColumnElement, Engine, and_, create_engine, delete, event, func, or_, select, update
-from sqlalchemy.orm import sessionmaker
+from sqlalchemy import Engine, and_, delete, func, or_, select, update
 
-from service.jobs.model import FINAL_STATES, Base, Job, JobState, new_job_id, sources
+from service.access import quotas
+from service.access.quotas import Quota, Usage
+from service.database import clock_of, open_database
+from service.jobs import idempotency, journal
+from service.jobs.idempotency import Reservation
+from service.jobs.model import LOCAL, Job, JobKind, JobState, new_job_id
+from service.jobs.table import JobTable, held, rows, unheld
 from service.settings import Settings
 
 LOST_ADVICE = "Submit the video again; if it fails the same way, try a shorter or smaller clip."
+_ALL = 1_000_000
 #: The reconciler leaves a new row this long to whoever created it.
 _PUBLISH_GRACE = 2.0
 
 
 @dataclass(frozen=True)
 class Claim:
-    """The right to work on a job until the lease ends. ``video`` is relative to the data directory."""
+    """The right to work on a job until the lease ends. ``video`` is relative to the data directory.
+
+    ``restarted_from`` and ``from_stage``: begin at that stage with that job's checkpoints, if it left any.
+    """
 
     job_id: str
     token: str
     attempt: int
     options: dict[str, Any]
     video: str
+    restarted_from: str | None = None
+    from_stage: str | None = None
+    traceparent: str | None = None
+    queue: str = "cpu"
+    kind: str = JobKind.FIT
 
     @property
     def artifact(self) -> str:
@@ -52,13 +61,13 @@ class Heartbeat(StrEnum):
 class Cancel(StrEnum):
     """What a request to cancel did."""
 
-    CANCELLED = "cancelled"  # it was queued and is over
+    CANCELLED = "cancelled"  # it had not begun, or was cancelled before: it is over
     REQUESTED = "requested"  # it is running; the worker has been told
-    FINISHED = "finished"  # it was over already
+    FINISHED = "finished"  # it was over already, in another way
     UNKNOWN = "unknown"
 
 
-class JobStore:
+class JobStore(JobTable):
     """Synchronous and thread-safe: every method is one short transaction of its own."""
 
     def __init__(
@@ -69,19 +78,17 @@ class JobStore:
         republish: tuple[float, float] = (60.0, 600.0),
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._engine = engine
-        self._session = sessionmaker(engine, expire_on_commit=False)
+        super().__init__(engine, clock)
         self._max_attempts = max_attempts
         self._republish = republish
-        self._clock = clock
 
     def close(self) -> None:
         """Close the pooled connections."""
-        self._engine.dispose()
+        self.engine.dispose()
 
     def ping(self) -> None:
         """Raise when the database does not answer."""
-        with self._engine.connect() as connection:
+        with self.engine.connect() as connection:
             connection.execute(select(1))
 
     # Users
@@ -93,72 +100,161 @@ class JobStore:
         *,
         job_id: str | None = None,
         video_bytes: int | None = None,
+        queue: str = "cpu",
+        owner: str = LOCAL,
+        kind: JobKind = JobKind.FIT,
+        parent: str | None = None,
+        awaits_upload: bool = False,
+        restarted_from: str | None = None,
+        from_stage: str | None = None,
+        traceparent: str | None = None,
+        idempotency_key: tuple[Reservation, str] | None = None,
+        quota: Quota | None = None,
     ) -> Job:
-        """Insert a queued job. ``video`` is the upload's path relative to the data directory."""
+        """Insert a job: queued, or awaiting its upload.
+
+        ``video`` is the upload's path relative to the data directory. ``idempotency_key``: the reservation
+        of the request and its fingerprint; raises ReservationLostError, and inserts nothing, when another
+        request was faster. ``quota``: raises QuotaError when the owner would have more than that.
+        """
         now = self._clock()
         job = Job(
             id=job_id or new_job_id(now),
-            state=JobState.QUEUED,
+            owner=owner,
+            kind=kind,
+            parent=parent,
+            state=JobState.AWAITING_UPLOAD if awaits_upload else JobState.QUEUED,
             options=dict(options),
+            queue=queue,
             video=video,
             video_bytes=video_bytes,
+            restarted_from=restarted_from,
+            from_stage=from_stage,
+            traceparent=traceparent,
             created_at=now,
             publish_due_at=now + _PUBLISH_GRACE,
         )
         with self._session.begin() as session:
-            session.add(job)
+            quotas.serialise(session, owner)
+            self._insert(session, job)
+            if idempotency_key is not None:
+                reservation, fingerprint = idempotency_key
+                idempotency.bind(session, reservation, fingerprint, job.id)
+            if quota is not None:
+                # After the insert, which makes this the only transaction that counts for this owner.
+                quotas.check(quotas.usage(session, owner, now), quota)
         return job
 
-    def get(self, job_id: str) -> Job | None:
-        """The job as it is now, detached; None when it is unknown or deleted."""
+    def check_quota(self, owner: str, quota: Quota, jobs: int = 0, size: int = 0) -> None:
+        """Raise QuotaError when so much more would be too much."""
         with self._session() as session:
-            return session.scalar(select(Job).where(Job.id == job_id, Job.deleted_at.is_(None)))
+            have = quotas.usage(session, owner, self._clock())
+        quotas.check(Usage(have.jobs + jobs, have.bytes + size, have.minutes), quota)
 
-    def page(self, limit: int = 50, cursor: str | None = None) -> tuple[list[Job], str | None]:
-        """Newest first; ``cursor`` is what the page before returned, None when that was the last."""
-        query = select(Job).where(Job.deleted_at.is_(None)).order_by(Job.id.desc()).limit(limit + 1)
+    def get(self, job_id: str, owner: str | None = None) -> Job | None:
+        """The job as it is now, detached; None when it is unknown, deleted, or not ``owner``'s."""
+        query = select(Job).where(Job.id == job_id, Job.deleted_at.is_(None))
+        if owner is not None:
+            query = query.where(Job.owner == owner)
+        with self._session() as session:
+            return session.scalar(query)
+
+    def page(
+        self,
+        limit: int = 50,
+        cursor: str | None = None,
+        owner: str | None = None,
+        states: Collection[JobState] = (),
+        parent: str | None = None,
+    ) -> tuple[list[Job], str | None]:
+        """Newest first; ``cursor`` is what the page before returned, None when that was the last.
+
+        Jobs of videos, or with ``parent`` the renders of that job.
+        """
+        which = Job.kind == JobKind.FIT if parent is None else Job.parent == parent
+        query = select(Job).where(which, Job.deleted_at.is_(None)).order_by(Job.id.desc()).limit(limit + 1)
         if cursor is not None:
             query = query.where(Job.id < cursor)
+        if owner is not None:
+            query = query.where(Job.owner == owner)
+        if states:
+            query = query.where(Job.state.in_(states))
         with self._session() as session:
-            rows = [*session.scalars(query)]
-        return rows[:limit], rows[limit - 1].id if len(rows) > limit else None
+            found = [*session.scalars(query)]
+        return found[:limit], found[limit - 1].id if len(found) > limit else None
 
     def known(self, job_ids: set[str]) -> set[str]:
         """Which of these ids have a row, deleted ones not yet purged included."""
         with self._session() as session:
             return {*session.scalars(select(Job.id).where(Job.id.in_(job_ids)))}
 
+    def events(self, job_id: str, after: int = 0, limit: int = 500) -> list[journal.Entry]:
+        """Entries of the job's journal with numbers above ``after``, oldest first."""
+        with self._session() as session:
+            return journal.events_after(session, job_id, after, limit)
+
+    def logs(self, job_id: str, after: int = 0, limit: int = 500) -> list[journal.JobLog]:
+        """Log lines with ids above ``after``, oldest first."""
+        with self._session() as session:
+            return journal.lines_after(session, job_id, after, limit)
+
+    def upload_arrived(self, job_id: str, video_bytes: int) -> bool:
+        """The awaited video is there and whole: queue the job. False when it no longer awaits one."""
+        due = self._clock() + _PUBLISH_GRACE
+        values = {"video_bytes": video_bytes, "publish_due_at": due}
+        return bool(self._move(JobState.QUEUED, Job.id == job_id, *_awaiting(), **values))
+
+    def upload_refused(self, job_id: str, code: str, message: str, advice: str) -> bool:
+        """The awaited video cannot be used. False when the job no longer awaits one."""
+        error = {"error_code": code, "error_message": message, "error_advice": advice}
+        return bool(self._finish(JobState.FAILED, Job.id == job_id, *_awaiting(), **error))
+
     def request_cancel(self, job_id: str) -> Cancel:
-        """End a queued job at once, or ask the worker of a running one to stop. Safe to repeat."""
-        unfinished = Job.state.not_in(FINAL_STATES)
-        if not self._update(Job.id == job_id, unfinished, Job.deleted_at.is_(None), cancel_requested=True):
-            return Cancel.UNKNOWN if self.get(job_id) is None else Cancel.FINISHED
-        # From here on no claim and no requeue can succeed, so a queued job stays queued until this line.
-        ended = self._finish(job_id, JobState.CANCELLED, Job.state == JobState.QUEUED)
-        return Cancel.CANCELLED if ended else Cancel.REQUESTED
+        """End at once a job that has not begun, or ask the worker of a running one to stop. Repeatable."""
+        mine = (Job.id == job_id, Job.deleted_at.is_(None))
+        waiting = Job.state.in_((JobState.QUEUED, JobState.AWAITING_UPLOAD))
+        while True:
+            if self._finish(JobState.CANCELLED, *mine, waiting):
+                return Cancel.CANCELLED
+            if self._move(JobState.CANCELLING, *mine):
+                return Cancel.REQUESTED
+            job = self.get(job_id)
+            if job is None:
+                return Cancel.UNKNOWN
+            match job.state:
+                case JobState.CANCELLING:
+                    return Cancel.REQUESTED
+                case JobState.CANCELLED:
+                    return Cancel.CANCELLED
+                case JobState.SUCCEEDED | JobState.FAILED | JobState.EXPIRED:
+                    return Cancel.FINISHED
+            # It moved between the two statements, say from running back to the queue: once more.
 
     def delete(self, job_id: str) -> bool:
-        """Hide the job for good and stop its worker. False when it is unknown or deleted already.
+        """Hide the job and its renders for good, stop their workers. False when it is unknown or deleted.
 
         The bytes and the row go with :meth:`purge`, once no worker can write any more.
         """
-        now = self._clock()
-        gone = self._update(Job.id == job_id, Job.deleted_at.is_(None), deleted_at=now, cancel_requested=True)
-        if gone:
-            self._finish(job_id, JobState.CANCELLED, Job.state == JobState.QUEUED)
-        return gone
+        if self.request_cancel(job_id) is Cancel.UNKNOWN:
+            return False
+        for render in self.page(limit=_ALL, parent=job_id)[0]:
+            self.delete(render.id)
+        return self._update(Job.id == job_id, Job.deleted_at.is_(None), deleted_at=self._clock())
 
     def due_for_purge(self, limit: int = 100) -> list[str]:
         """Deleted jobs that no worker holds: remove their files, then :meth:`purge`."""
-        query = select(Job.id).where(Job.deleted_at.is_not(None), self._unheld()).limit(limit)
+        query = select(Job.id).where(Job.deleted_at.is_not(None), self._free()).limit(limit)
         with self._session() as session:
             return [*session.scalars(query)]
 
     def purge(self, job_id: str) -> bool:
-        """Remove the row of a deleted job that no worker holds. Its files must be gone before."""
-        statement = delete(Job).where(Job.id == job_id, Job.deleted_at.is_not(None), self._unheld())
+        """Remove the row and the journal of a deleted job that no worker holds. Its files must be gone."""
+        condition = (Job.id == job_id, Job.deleted_at.is_not(None), self._free())
         with self._session.begin() as session:
-            return _rows(session.execute(statement)) == 1
+            if session.scalar(select(Job.id).where(*condition).with_for_update()) is None:
+                return False
+            journal.erase(session, job_id)
+            return rows(session.execute(delete(Job).where(*condition))) == 1
 
     # Workers
 
@@ -171,41 +267,53 @@ class JobStore:
         now = self._clock()
         token = token or uuid.uuid4().hex
         expired = and_(Job.state == JobState.RUNNING, Job.lease_until < now)
-        statement = (
-            self._transition(
-                JobState.RUNNING,
-                Job.id == job_id,
-                Job.cancel_requested.is_(False),
-                Job.attempt < self._max_attempts,
-                or_(Job.state == JobState.QUEUED, expired),
-                token=token,
-                lease_until=now + lease_seconds,
-                attempt=Job.attempt + 1,
-                started_at=func.coalesce(Job.started_at, now),
-                stage=None,
-                fraction=0.0,
-                time_left=None,
-                message="",
-            )
-        ).returning(Job.attempt, Job.options, Job.video)
-        with self._session.begin() as session:
-            row = session.execute(statement).one_or_none()
-        return None if row is None else Claim(job_id, token, row.attempt, row.options, row.video)
+        begin: dict[str, Any] = {
+            **unheld(now),
+            "token": token,
+            "lease_until": now + lease_seconds,
+            "claimed_at": now,
+            "attempt": Job.attempt + 1,
+            "started_at": func.coalesce(Job.started_at, now),
+            "stage": None,
+            "stage_since": None,
+            "fraction": 0.0,
+            "message": "",
+            "warnings": [],
+        }
+        free = or_(Job.state == JobState.QUEUED, expired)
+        taken = self._move(
+            JobState.RUNNING, Job.id == job_id, Job.attempt < self._max_attempts, free, **begin
+        )
+        if not taken:
+            return None
+        job = taken[0]
+        return Claim(
+            job_id,
+            token,
+            job.attempt,
+            job.options,
+            job.video,
+            job.restarted_from,
+            job.from_stage,
+            job.traceparent,
+            job.queue,
+            job.kind,
+        )
 
     def heartbeat(self, job_id: str, token: str, lease_seconds: float = 60.0) -> Heartbeat:
         """Renew the lease and learn whether to go on."""
         statement = (
             update(Job)
-            .where(Job.id == job_id, *_held(token))
+            .where(Job.id == job_id, *held(token))
             .values(lease_until=self._clock() + lease_seconds)
-            .returning(Job.cancel_requested)
+            .returning(Job.state)
             .execution_options(synchronize_session=False)
         )
         with self._session.begin() as session:
-            cancel = session.scalar(statement)
-        if cancel is None:
+            state = session.scalar(statement)
+        if state is None:
             return Heartbeat.LOST
-        return Heartbeat.CANCEL if cancel else Heartbeat.OK
+        return Heartbeat.CANCEL if state == JobState.CANCELLING else Heartbeat.OK
 
     def report_progress(
         self,
@@ -218,9 +326,9 @@ class JobStore:
     ) -> bool:
         """Write progress; a report behind the one already there changes nothing but is no error."""
         fraction = min(max(fraction, 0.0), 1.0)
-        newer = self._update(
+        newer = self._progress(
             Job.id == job_id,
-            *_held(token),
+            *held(token),
             Job.fraction <= fraction,
             stage=stage,
             fraction=fraction,
@@ -229,38 +337,46 @@ class JobStore:
         )
         return newer or self._holds(job_id, token)
 
+    def log(self, job_id: str, token: str, lines: Sequence[str]) -> bool:
+        """Keep lines that the engine said, for the job's owner to read. False when fenced out."""
+        with self._session.begin() as session:
+            job = session.scalar(select(Job).where(Job.id == job_id, *held(token)).with_for_update())
+            if job is None:
+                return False
+            journal.write_lines(session, job, lines, self._clock())
+        return True
+
+    def report_warnings(self, job_id: str, token: str, warnings: list[dict[str, str]]) -> bool:
+        """All that the engine has warned of so far. False when fenced out."""
+        return self._update(Job.id == job_id, *held(token), warnings=warnings)
+
     def succeed(self, job_id: str, token: str, artifact: str) -> bool:
         """Publish ``artifact`` (a directory name, already on disk). False when fenced out or cancelled."""
-        return self._finish(
-            job_id,
-            JobState.SUCCEEDED,
-            *_held(token),
-            Job.cancel_requested.is_(False),
-            artifact=artifact,
-            fraction=1.0,
-        )
+        done = {"artifact": artifact, "fraction": 1.0}
+        return bool(self._finish(JobState.SUCCEEDED, Job.id == job_id, *held(token), **done))
 
     def fail(self, job_id: str, token: str, code: str, message: str, advice: str) -> bool:
-        """End the job with an error for its owner. False when fenced out."""
+        """End the job with an error for its owner; one being cancelled ends as cancelled. False when
+        fenced out."""
         error = {"error_code": code, "error_message": message, "error_advice": advice}
-        return self._finish(job_id, JobState.FAILED, *_held(token), **error)
+        failed = self._finish(JobState.FAILED, Job.id == job_id, *held(token), **error)
+        return bool(failed) or self.finish_cancel(job_id, token)
 
     def finish_cancel(self, job_id: str, token: str) -> bool:
         """The engine has stopped because the job was cancelled. False when fenced out."""
-        return self._finish(job_id, JobState.CANCELLED, *_held(token), Job.cancel_requested.is_(True))
+        return bool(self._finish(JobState.CANCELLED, Job.id == job_id, *held(token)))
 
     def release(self, job_id: str, token: str, *, refund: bool = True) -> bool:
         """Give the job back to the queue. False when fenced out.
 
         ``refund``: an orderly stop (a deploy) costs no attempt; a crashed engine does, and fails the job
-        with ``worker.lost`` when it was the last one. A cancelled job ends as cancelled instead.
+        with ``worker.lost`` when it was the last one. A job being cancelled ends as cancelled instead.
         """
-        if not refund and self._lost(Job.id == job_id, *_held(token)):
+        mine = (Job.id == job_id, *held(token))
+        if not refund and self._lost(Job.attempt >= self._max_attempts, *mine):
             return True
         attempt = Job.attempt - 1 if refund else Job.attempt
-        if self._requeue(Job.id == job_id, *_held(token), attempt=attempt):
-            return True
-        return self.finish_cancel(job_id, token)
+        return bool(self._requeue(*mine, attempt=attempt)) or self.finish_cancel(job_id, token)
 
     # Reconciler
 
@@ -268,16 +384,18 @@ class JobStore:
         """Queued jobs whose wake-up message has to be sent (again), longest overdue first."""
         query = (
             select(Job.id)
-            .where(Job.state == JobState.QUEUED, Job.cancel_requested.is_(False))
-            .where(Job.publish_due_at <= self._clock())
+            .where(Job.state == JobState.QUEUED, Job.publish_due_at <= self._clock())
             .order_by(Job.publish_due_at)
             .limit(limit)
         )
         with self._session() as session:
             return [*session.scalars(query)]
 
-    def mark_published(self, job_id: str) -> bool:
-        """The message went out; it is due again after a wait that doubles each time, up to the maximum."""
+    def mark_published(self, job_id: str, *, if_due: bool = False) -> bool:
+        """The message went out; it is due again after a wait that doubles each time, up to the maximum.
+
+        ``if_due``: only if it is due now, so that of several reconcilers one sends it.
+        """
         job = self.get(job_id)
         if job is None:
             return False
@@ -287,101 +405,64 @@ class JobStore:
         return self._update(
             Job.id == job_id,
             Job.publish_attempts == job.publish_attempts,
+            *((Job.publish_due_at <= now,) if if_due else ()),
             last_published_at=now,
             publish_attempts=job.publish_attempts + 1,
             publish_due_at=now + wait,
         )
 
+    def mark_unpublished(self, job_id: str) -> bool:
+        """The message marked last did not go out after all: it is due at once."""
+        back = {"publish_attempts": Job.publish_attempts - 1, "publish_due_at": self._clock()}
+        return self._update(Job.id == job_id, Job.publish_attempts > 0, **back)
+
     def requeue_expired_leases(self, max_attempts: int | None = None) -> list[str]:
         """Take back jobs whose worker went silent; returns those queued again.
 
-        Cancelled ones end as cancelled, those out of attempts as failed with ``worker.lost``.
+        Those being cancelled end as cancelled, those out of attempts as failed with ``worker.lost``.
         """
-        expired = (Job.state == JobState.RUNNING, Job.lease_until < self._clock())
-        cancelled = self._transition(
-            JobState.CANCELLED, *expired, Job.cancel_requested.is_(True), **self._ended()
-        )
-        with self._session.begin() as session:
-            session.execute(cancelled)
-        self._lost(*expired, max_attempts=max_attempts)
-        return self._requeue(*expired)
+        silent = Job.lease_until < self._clock()
+        self._finish(JobState.CANCELLED, Job.state == JobState.CANCELLING, silent)
+        limit = self._max_attempts if max_attempts is None else max_attempts
+        self._lost(Job.attempt >= limit, Job.state == JobState.RUNNING, silent)
+        return [job.id for job in self._requeue(Job.state == JobState.RUNNING, silent)]
+
+    def now(self) -> float:
+        """The time that rows are stamped with, seconds since 1970."""
+        return self._clock()
+
+    def mark_dropped(self, job_id: str, *, video: bool) -> bool:
+        """The job's video (or its checkpoint) has been removed."""
+        column = "video_dropped_at" if video else "checkpoint_dropped_at"
+        return self._update(Job.id == job_id, **{column: self._clock()})
+
+    def expire_upload(self, job_id: str) -> bool:
+        """The awaited video did not arrive in time. False when the job no longer awaits one."""
+        return bool(self._finish(JobState.EXPIRED, Job.id == job_id, *_awaiting()))
 
     # How
 
-    def _transition(self, target: JobState, *where: ColumnElement[bool], **values: Any) -> Any:
-        """The only statement that writes a state: it leaves none but those the table allows."""
-        statement = update(Job).where(Job.state.in_(sources(target)), *where).values(state=target, **values)
-        return statement.execution_options(synchronize_session=False)
+    def _lost(self, *where: Any) -> bool:
+        said = "The worker stopped on every attempt to work on this video."
+        error = {"error_code": "worker.lost", "error_message": said, "error_advice": LOST_ADVICE}
+        return bool(self._finish(JobState.FAILED, Job.state == JobState.RUNNING, *where, **error))
 
-    def _ended(self) -> dict[str, Any]:
-        return {"finished_at": self._clock(), "token": None, "lease_until": None, "time_left": None}
-
-    def _finish(self, job_id: str, target: JobState, *where: ColumnElement[bool], **values: Any) -> bool:
-        assert target in FINAL_STATES
-        statement = self._transition(target, Job.id == job_id, *where, **self._ended(), **values)
-        with self._session.begin() as session:
-            return _rows(session.execute(statement)) == 1
-
-    def _lost(self, *where: ColumnElement[bool], max_attempts: int | None = None) -> bool:
-        limit = self._max_attempts if max_attempts is None else max_attempts
-        statement = self._transition(
-            JobState.FAILED,
-            Job.attempt >= limit,
-            *where,
-            error_code="worker.lost",
-            error_message=f"The worker stopped {limit} times while working on this video.",
-            error_advice=LOST_ADVICE,
-            **self._ended(),
+    def _requeue(self, *where: Any, **values: Any) -> list[Job]:
+        now = self._clock()
+        again = {"publish_due_at": now, "publish_attempts": 0}
+        return self._move(
+            JobState.QUEUED, Job.state == JobState.RUNNING, *where, **unheld(now), **again, **values
         )
-        with self._session.begin() as session:
-            return _rows(session.execute(statement)) > 0
-
-    def _requeue(self, *where: ColumnElement[bool], **values: Any) -> list[str]:
-        back = {"token": None, "lease_until": None, "time_left": None, "publish_due_at": self._clock()}
-        going = Job.cancel_requested.is_(False)
-        statement = self._transition(JobState.QUEUED, going, *where, **back, publish_attempts=0, **values)
-        with self._session.begin() as session:
-            return [*session.scalars(statement.returning(Job.id))]
-
-    def _update(self, *where: ColumnElement[bool], **values: Any) -> bool:
-        statement = update(Job).where(*where).values(**values).execution_options(synchronize_session=False)
-        with self._session.begin() as session:
-            return _rows(session.execute(statement)) == 1
-
-    def _holds(self, job_id: str, token: str) -> bool:
-        with self._session() as session:
-            return session.scalar(select(Job.id).where(Job.id == job_id, *_held(token))) is not None
-
-    def _unheld(self) -> ColumnElement[bool]:
-        return or_(Job.state != JobState.RUNNING, Job.lease_until < self._clock())
 
 
-def _held(token: str) -> tuple[ColumnElement[bool], ...]:
-    """The fence: still running, and under this claim."""
-    return Job.state == JobState.RUNNING, Job.token == token
+def _awaiting() -> tuple[Any, ...]:
+    return (Job.state == JobState.AWAITING_UPLOAD,)
 
 
-def _rows(result: Any) -> int:
-    return int(result.rowcount)
-
-
-def create_store(settings: Settings, clock: Callable[[], float] = time.time) -> JobStore:
-    """Open (and on first use create) the database of ``settings``."""
-    url = settings.database
-    if url.startswith("sqlite"):
-        settings.data_dir.mkdir(parents=True, exist_ok=True)
-        engine = create_engine(url, connect_args={"timeout": 30.0})
-        event.listen(engine, "connect", _prepare_sqlite)
-    else:
-        engine = create_engine(url, pool_pre_ping=True)
-    Base.metadata.create_all(engine)
+def create_store(settings: Settings, clock: Callable[[], float] | None = None) -> JobStore:
+    """Open (and on first use create, or migrate) the database of ``settings``. Raises DatabaseError."""
+    engine = open_database(settings)
     republish = (settings.republish_min_seconds, settings.republish_max_seconds)
-    return JobStore(engine, max_attempts=settings.max_attempts, republish=republish, clock=clock)
-
-
-def _prepare_sqlite(connection: Any, _record: Any) -> None:
-    cursor = connection.cursor()
-    # synchronous=FULL: a job answered with 202 must survive a power cut; writes are few.
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=30000"):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.close()
+    return JobStore(
+        engine, max_attempts=settings.max_attempts, republish=republish, clock=clock or clock_of(engine)
+    )

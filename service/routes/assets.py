@@ -11,10 +11,12 @@ from urllib.parse import quote
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
+from service.access.gate import CallerDep
 from service.jobs.schemas import AssetList, AssetView
 from service.problems import Kind, ProblemError, declared
 from service.routes.jobs import JobId
 from service.services import ServicesDep, not_modified
+from service.storage import MEDIA_TYPES
 
 router = APIRouter(prefix="/jobs", tags=["results"])
 
@@ -26,9 +28,9 @@ _ONE_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
     "/{job_id}/assets",
     responses=declared(Kind.JOB_NOT_FOUND, Kind.JOB_NOT_READY, Kind.JOB_NO_RESULT),
 )
-def list_assets(job_id: JobId, services: ServicesDep) -> AssetList:
+def list_assets(job_id: JobId, services: ServicesDep, caller: CallerDep) -> AssetList:
     """The files, with size and SHA-256."""
-    found = services.storage.assets(job_id, services.artifact(job_id))
+    found = services.storage.assets(job_id, services.artifact(job_id, caller))
     views = [AssetView(**vars(asset), href=f"/jobs/{job_id}/assets/{quote(asset.name)}") for asset in found]
     return AssetList(assets=views)
 
@@ -39,7 +41,12 @@ def list_assets(job_id: JobId, services: ServicesDep) -> AssetList:
     responses={
         200: {
             "description": "The file.",
-            "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+            "content": {
+                kind: {}
+                if kind.endswith("json")
+                else {"schema": {"type": "string", "contentMediaType": kind}}
+                for kind in sorted(MEDIA_TYPES)
+            },
         },
         206: {"description": "The range asked for (one range; several are answered with the whole file)."},
         304: {"description": "Unchanged since the ETag sent."},
@@ -53,9 +60,10 @@ def get_asset(
     name: Annotated[str, Path(max_length=200, description="A name from the list of assets.")],
     request: Request,
     services: ServicesDep,
+    caller: CallerDep,
 ) -> Response:
     """Download one file; `Range` resumes a broken download."""
-    found = services.storage.open_asset(job_id, services.artifact(job_id), name)
+    found = services.storage.open_asset(job_id, services.artifact(job_id, caller), name)
     if found is None:
         raise ProblemError(Kind.ASSET_NOT_FOUND)
     asset, path = found

@@ -1,119 +1,48 @@
-"""Jobs: submit, list, look, cancel, delete."""
+"""Jobs: list, look, cancel, restart, delete. How they come in is routes/submission.py."""
 
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
-from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
 
+from service.access.gate import CallerDep
 from service.jobs.housekeeping import purge_deleted
-from service.jobs.model import Job, is_job_id, new_job_id
-from service.jobs.schemas import JobOptions, JobPage, JobView, job_view
+from service.jobs.model import JobState, is_job_id
+from service.jobs.schemas import JobPage, JobView, job_view
 from service.jobs.store import Cancel
 from service.problems import Kind, ProblemError, declared
-from service.services import Services, ServicesDep, not_modified
-from service.uploads import ReceivedForm, receive_form, refuse_early
+from service.services import ServicesDep, not_modified
+from service.tus import lifecycle
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
 JobId = Annotated[str, Path(description="The id `POST /jobs` answered with.", max_length=64)]
 
-_FORM: dict[str, Any] = {
-    "required": True,
-    "content": {
-        "multipart/form-data": {
-            "schema": {
-                "type": "object",
-                "required": ["video"],
-                "additionalProperties": False,
-                "properties": {
-                    "video": {
-                        "type": "string",
-                        "contentMediaType": "application/octet-stream",
-                        "description": "An MP4, MOV or WebM file of one hand.",
-                    },
-                    "options": {
-                        "type": "string",
-                        "contentMediaType": "application/json",
-                        "contentSchema": JobOptions.model_json_schema(),
-                        "description": "JSON; every option may be left out.",
-                    },
-                },
-            },
-            "encoding": {"options": {"contentType": "application/json"}},
-        }
-    },
-}
+
+Cursor = Annotated[str | None, Query(max_length=64, description="`next` of the page before.")]
 
 
-@router.post(
-    "",
-    status_code=202,
-    response_model=JobView,
-    openapi_extra={"requestBody": _FORM},
-    responses={
-        202: {
-            "description": "Accepted; `Location` is where to look for progress.",
-            "headers": {"Location": {"schema": {"type": "string"}}},
-        },
-        **declared(
-            Kind.REQUEST_MALFORMED,
-            Kind.UPLOAD_INCOMPLETE,
-            Kind.UPLOAD_STALLED,
-            Kind.UPLOAD_TOO_LARGE,
-            Kind.REQUEST_MEDIA_TYPE,
-            Kind.VIDEO_CONTAINER,
-            Kind.REQUEST_INVALID,
-            Kind.VIDEO_MISSING,
-            Kind.VIDEO_EMPTY,
-            Kind.OPTIONS_INVALID,
-            Kind.STORAGE_FULL,
-        ),
-    },
-)
-async def create_job(request: Request, response: Response, services: ServicesDep) -> JobView:
-    """Submit a video. It is written to disk as it arrives and refused at the first thing wrong with it."""
-    limit = services.settings.max_upload_bytes
-    refuse_early(request, services.storage, limit)
-    job_id = new_job_id()
-    target = await run_in_threadpool(services.storage.begin_upload, job_id)
-    try:
-        form = await receive_form(request, target, services.storage, limit)
-        job = await run_in_threadpool(_accept, services, job_id, form)
-    except BaseException:
-        # Not awaited in a thread: a cancelled request may await nothing more.
-        services.storage.discard_upload(job_id)
-        raise
-    await run_in_threadpool(_announce, services, job_id)
-    response.headers["Location"] = f"/jobs/{job_id}"
-    return job_view(job)
-
-
-def _accept(services: Services, job_id: str, form: ReceivedForm) -> Job:
-    video = services.storage.finish_upload(job_id)
-    options = form.options.model_dump(exclude_none=True)
-    return services.store.create(options, video, job_id=job_id, video_bytes=form.video_bytes)
-
-
-def _announce(services: Services, job_id: str) -> None:
-    if services.queue.publish(job_id):
-        services.store.mark_published(job_id)
+def checked_cursor(cursor: str | None) -> str | None:
+    """The cursor, if it is one. Raises ProblemError (422)."""
+    if cursor is not None and not is_job_id(cursor):
+        error = {"field": "query.cursor", "message": "Not a cursor this service gave out."}
+        raise ProblemError(Kind.REQUEST_INVALID, errors=[error])
+    return cursor
 
 
 @router.get("", responses=declared(Kind.REQUEST_INVALID))
 def list_jobs(
     services: ServicesDep,
+    caller: CallerDep,
     limit: Annotated[int, Query(ge=1, le=100)] = 20,
-    cursor: Annotated[str | None, Query(max_length=64, description="`next` of the page before.")] = None,
+    cursor: Cursor = None,
+    state: Annotated[list[JobState] | None, Query(max_length=8, description="Only jobs in these.")] = None,
 ) -> JobPage:
-    """The jobs, newest first."""
-    if cursor is not None and not is_job_id(cursor):
-        error = {"field": "query.cursor", "message": "Not a cursor this service gave out."}
-        raise ProblemError(Kind.REQUEST_INVALID, errors=[error])
-    jobs, following = services.store.page(limit, cursor)
+    """The jobs, newest first. A job that arrives while the pages are read belongs before the first."""
+    jobs, following = services.store.page(limit, checked_cursor(cursor), caller.sees, state or ())
     return JobPage(jobs=[job_view(job) for job in jobs], next=following)
 
 
@@ -122,9 +51,9 @@ def list_jobs(
     response_model=JobView,
     responses={304: {"description": "Unchanged since the ETag sent."}, **declared(Kind.JOB_NOT_FOUND)},
 )
-def get_job(job_id: JobId, request: Request, services: ServicesDep) -> Response:
+def get_job(job_id: JobId, request: Request, services: ServicesDep, caller: CallerDep) -> Response:
     """State, stage, progress and, if it failed, why. Poll with `If-None-Match`."""
-    body = job_view(services.job(job_id)).model_dump(mode="json")
+    body = job_view(services.job(job_id, caller)).model_dump(mode="json")
     response = JSONResponse(body, headers={"Cache-Control": "private, no-cache"})
     etag = f'"{hashlib.sha256(response.body).hexdigest()[:32]}"'
     if not_modified(request, etag):
@@ -133,20 +62,34 @@ def get_job(job_id: JobId, request: Request, services: ServicesDep) -> Response:
     return response
 
 
-@router.post("/{job_id}/cancel", status_code=202, responses=declared(Kind.JOB_NOT_FOUND, Kind.JOB_FINISHED))
-def cancel_job(job_id: JobId, services: ServicesDep) -> JobView:
-    """End a queued job at once, or have a running one stopped. May be repeated while it is stopping."""
-    job = services.job(job_id)
-    if services.store.request_cancel(job.id) == Cancel.FINISHED:
+@router.post(
+    "/{job_id}/cancel",
+    responses={
+        200: {"description": "The job is cancelled."},
+        202: {"description": "A worker is stopping it; the state is `cancelling`.", "model": JobView},
+        **declared(Kind.JOB_NOT_FOUND, Kind.JOB_FINISHED),
+    },
+)
+def cancel_job(job_id: JobId, services: ServicesDep, caller: CallerDep, response: Response) -> JobView:
+    """End a job that has not begun at once, or have a running one stopped. May be repeated."""
+    services.job(job_id, caller)
+    outcome = services.store.request_cancel(job_id)
+    job = services.job(job_id, caller)
+    if outcome is Cancel.FINISHED:
         raise ProblemError(Kind.JOB_FINISHED, f"The job is {job.state}.")
-    return job_view(services.job(job_id))
+    if outcome is Cancel.CANCELLED:
+        lifecycle.end(services.uploads, services.store, services.storage, job_id)
+    response.status_code = 200 if job.state == JobState.CANCELLED else 202
+    return job_view(job)
 
 
 @router.delete("/{job_id}", status_code=204, responses=declared(Kind.JOB_NOT_FOUND))
-def delete_job(job_id: JobId, services: ServicesDep) -> None:
+def delete_job(job_id: JobId, services: ServicesDep, caller: CallerDep) -> None:
     """Remove the job, its video and its results. A running job vanishes at once; its bytes go when its
     worker has stopped."""
-    if not is_job_id(job_id) or not services.store.delete(job_id):
+    services.job(job_id, caller)
+    if not services.store.delete(job_id):
         raise ProblemError(Kind.JOB_NOT_FOUND)
+    services.uploads.remove(job_id)
     services.pictures.drop(job_id)
     purge_deleted(services.store, services.storage)

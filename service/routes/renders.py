@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 
-from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, canonical_view
-from service.problems import Kind, declared
-from service.routes.jobs import JobId
-from service.services import ServicesDep, not_modified
+from service.access.gate import CallerDep
+from service.jobs.model import JobKind
+from service.jobs.schemas import JobPage, JobView, MotionRequest, job_view
+from service.motions import canonical_motion
+from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, View, canonical_view
+from service.problems import Kind, ProblemError, declared
+from service.routes.jobs import Cursor, JobId, checked_cursor
+from service.routes.submission import ACCEPTED, IDEMPOTENCY, IdempotencyKey
+from service.services import Services, ServicesDep, not_modified
+from service.submission import Wanted, fingerprint, spelled, submit
 
 router = APIRouter(prefix="/jobs", tags=["results"])
 
+Hand = Annotated[
+    Literal["left", "right"] | None,
+    Query(description="Of a job for both hands, which; absent: the only one, or the right one."),
+]
 Side = Annotated[int, Query(ge=MIN_SIDE, le=MAX_SIDE, description="Pixels.")]
 
 
@@ -36,6 +50,7 @@ Side = Annotated[int, Query(ge=MIN_SIDE, le=MAX_SIDE, description="Pixels.")]
             Kind.POSE_INVALID,
             Kind.CAMERA_INVALID,
             Kind.RENDER_TOO_LARGE,
+            Kind.RENDER_NO_HAND,
             Kind.RENDER_REFUSED,
             Kind.RENDER_FAILED,
             Kind.RENDER_BUSY,
@@ -47,6 +62,7 @@ def render_job(
     job_id: JobId,
     request: Request,
     services: ServicesDep,
+    caller: CallerDep,
     pose: Annotated[
         str,
         Query(
@@ -63,6 +79,7 @@ def render_job(
             "at a distance that fits it into the picture; `orbit:YAW,PITCH,DISTANCE` names it in metres.",
         ),
     ] = "orbit:0,0",
+    hand: Hand = None,
     width: Side = 512,
     height: Side = 512,
     format: Annotated[PictureFormat, Query()] = "png",
@@ -77,15 +94,101 @@ def render_job(
     ] = "rgb",
 ) -> Response:
     """Render the hand. Repeated requests are answered from a cache; use `If-None-Match`."""
-    artifact = services.artifact(job_id)
+    artifact = services.avatar(job_id, caller)
     most = services.settings.max_render_pixels
     view = canonical_view(pose, camera, width, height, format, most, channel)
+    part = _folder(services.storage.published(job_id, artifact), hand)
+    view = replace(view, hand=part.name if part.name in ("left", "right") else "")
     headers = {"ETag": view.etag(job_id, artifact), "Cache-Control": "private, no-cache"}
     if not_modified(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     picture = services.pictures.get(job_id, artifact, view)
-    if picture is None:
-        avatar = services.storage.artifact_path(job_id, artifact) / "avatar.safetensors"
-        picture = services.pool.render(avatar, view)
+    if picture is not None:
+        services.metrics.renders.labels("cached").inc()
+    else:
+        picture = _draw(services, part / "avatar.safetensors", view)
         services.pictures.put(job_id, artifact, view, picture)
     return Response(picture, media_type=view.media_type, headers=headers)
+
+
+@router.post(
+    "/{job_id}/renders",
+    status_code=202,
+    responses={
+        **ACCEPTED,
+        **declared(
+            Kind.REQUEST_INVALID,
+            Kind.POSE_INVALID,
+            Kind.CAMERA_INVALID,
+            Kind.RENDER_TOO_LARGE,
+            Kind.RENDER_NO_HAND,
+            Kind.JOB_NOT_READY,
+            Kind.JOB_NO_RESULT,
+            Kind.QUOTA,
+            *IDEMPOTENCY,
+        ),
+    },
+)
+async def create_render(
+    job_id: JobId,
+    request: Request,
+    response: Response,
+    services: ServicesDep,
+    caller: CallerDep,
+    body: MotionRequest | None = None,
+    hand: Hand = None,
+    idempotency_key: IdempotencyKey = None,
+) -> JobView:
+    """Render a motion, as a small job of its own: follow it as any job; its file is the asset `motion.mp4`
+    or `motion.webp`. It is deleted with the job whose hand it shows, or by itself."""
+    motion = canonical_motion(body or MotionRequest(), services.settings)
+
+    def share(new_id: str) -> Wanted:
+        artifact = services.avatar(job_id, caller)
+        part = _folder(services.storage.artifact_path(job_id, artifact), hand)
+        try:
+            avatar = services.storage.share(part / "avatar.safetensors", new_id)
+        except FileNotFoundError:
+            raise ProblemError(Kind.JOB_NO_RESULT) from None
+        mark = fingerprint(f"POST /jobs/{job_id}/renders", part.name, spelled(motion))
+        return Wanted(new_id, motion, avatar, None, mark, kind=JobKind.RENDER, parent=job_id)
+
+    async def receive(new_id: str) -> Wanted:
+        return await run_in_threadpool(share, new_id)
+
+    return job_view(await submit(services, request, response, caller, idempotency_key, receive))
+
+
+@router.get("/{job_id}/renders", responses=declared(Kind.JOB_NOT_FOUND, Kind.REQUEST_INVALID))
+def list_renders(
+    job_id: JobId,
+    services: ServicesDep,
+    caller: CallerDep,
+    limit: Annotated[int, Query(ge=1, le=100)] = 20,
+    cursor: Cursor = None,
+) -> JobPage:
+    """The motions of this job's hand, newest first."""
+    services.job(job_id, caller)
+    jobs, following = services.store.page(limit, checked_cursor(cursor), caller.sees, parent=job_id)
+    return JobPage(jobs=[job_view(job) for job in jobs], next=following)
+
+
+def _draw(services: Services, avatar: Path, view: View) -> bytes:
+    start = time.perf_counter()
+    try:
+        picture = services.pool.render(avatar, view)
+    except ProblemError as error:
+        services.metrics.renders.labels(error.kind.code).inc()
+        raise
+    services.metrics.renders.labels("drawn").inc()
+    services.metrics.render_seconds.observe(time.perf_counter() - start)
+    return picture
+
+
+def _folder(result: Path, hand: str | None) -> Path:
+    """Where the files of the hand lie: in the result itself, or in the hand's own folder."""
+    hands = [name for name in ("right", "left") if (result / name).is_dir()]
+    if hand is not None and hand not in hands:
+        detail = f"It has the {' and the '.join(hands)} hand." if hands else "It was not made for both hands."
+        raise ProblemError(Kind.RENDER_NO_HAND, detail)
+    return result / (hand or hands[0]) if hands else result

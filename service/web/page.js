@@ -13,11 +13,25 @@ function complain(problem) {
   if (problem) $("problem").textContent = `${problem.detail || problem.message} ${problem.advice || ""}`;
 }
 
+// A service that asks for keys gets the one typed in, which this tab forgets when it is closed.
+const auth = () => (sessionStorage.key ? { Authorization: `Bearer ${sessionStorage.key}` } : {});
+
+async function ask(path, options) {
+  const answer = await fetch(path, { ...options, headers: { ...options?.headers, ...auth() } });
+  if (answer.ok) return answer;
+  if (answer.status === 401) show("login", true);
+  throw await answer.json();
+}
+
 async function call(path, options) {
-  const answer = await fetch(path, options);
-  const body = answer.status === 204 ? null : await answer.json();
-  if (!answer.ok) throw body;
-  return body;
+  const answer = await ask(path, options);
+  return answer.status === 204 ? null : answer.json();
+}
+
+async function save(job, name) { // an ordinary download, by a link that works for a minute
+  const body = JSON.stringify({ target: `assets/${name}`, seconds: 60 });
+  const headers = { "Content-Type": "application/json" };
+  location.href = (await call(`/jobs/${job}/links`, { method: "POST", headers, body })).href;
 }
 
 function row(text, href, note) {
@@ -41,6 +55,7 @@ async function send(file) {
   request.onerror = () => complain({ detail: "The connection broke.", advice: "Send the video again." });
   request.onload = () => (request.status === 202 ? watch(request.response.id) : complain(request.response));
   request.open("POST", "/jobs");
+  for (const [name, value] of Object.entries(auth())) request.setRequestHeader(name, value);
   request.send(form);
   show("result", false);
   progress("uploading", 0, null, "");
@@ -71,30 +86,56 @@ async function watch(id) {
   if (current !== id) return;
   complain(job.error);
   const label = job.state === "running" && job.stage ? job.stage : job.state;
-  progress(job.cancel_requested ? "stopping" : label, job.fraction, job.time_left, job.message);
-  show("cancel", Boolean(job.links.cancel) && !job.cancel_requested);
+  progress(label, job.fraction, job.time_left, job.message);
+  show("cancel", Boolean(job.links.cancel) && job.state !== "cancelling");
   show("delete", !job.links.cancel);
   show("result", Boolean(job.links.render));
+  if (job.state === "running") look(job);
+  else show("preview", false);
   if (job.links.cancel) timer = setTimeout(() => watch(id), 1000);
   else list();
   if (job.links.render) {
-    picture();
     const { assets } = await call(job.links.assets);
-    $("assets").replaceChildren(...assets.map((a) => row(a.name, a.href, `${(a.bytes / 1e6).toFixed(2)} MB`)));
+    const hands = ["right", "left"].filter((hand) => assets.some((a) => a.name.startsWith(`${hand}/`)));
+    show("hands", hands.length === 2);
+    picture();
+    $("assets").replaceChildren(...assets.map((a) => {
+      const item = row(a.name, a.href, `${(a.bytes / 1e6).toFixed(2)} MB`);
+      item.firstChild.onclick = (event) => { event.preventDefault(); save(id, a.name).catch(complain); };
+      return item;
+    }));
   }
 }
 
-function picture() {
+async function look(job) { // the hand as it is now; there is none before it is coloured
+  const answer = await fetch(job.links.preview, { headers: auth() });
+  if (!answer.ok || current !== job.id) return;
+  URL.revokeObjectURL($("preview").src);
+  $("preview").src = URL.createObjectURL(await answer.blob());
+  show("preview", true);
+}
+
+async function picture() {
   const camera = `orbit:${$("yaw").value},0`;
   const query = new URLSearchParams({
     pose, camera, width: 512, height: 512, format: "webp", channel: $("channel").value,
   });
+  if (!$("hands").hidden) query.set("hand", $("hand").value);
   $("picture").classList.add("busy");
-  $("picture").src = `/jobs/${current}/render?${query}`;
   for (const button of $("poses").children) button.setAttribute("aria-pressed", button.textContent === pose);
+  try {
+    const drawn = await (await ask(`/jobs/${current}/render?${query}`)).blob();
+    if (query.get("pose") !== pose) return; // another one has been asked for since
+    URL.revokeObjectURL($("picture").src);
+    $("picture").src = URL.createObjectURL(drawn);
+  } catch (problem) {
+    $("picture").classList.remove("busy");
+    complain(problem);
+  }
 }
 
 async function list() {
+  show("login", false);
   const { jobs } = await call("/jobs?limit=10");
   $("jobs").replaceChildren(...jobs.map((job) => row(new Date(job.created_at).toLocaleString(), `#${job.id}`, job.state)));
 }
@@ -105,7 +146,7 @@ $("poses").append(...POSES.map((name) => {
   return button;
 }));
 $("picture").onload = $("picture").onerror = () => $("picture").classList.remove("busy");
-$("yaw").onchange = $("channel").onchange = picture;
+$("yaw").onchange = $("channel").onchange = $("hand").onchange = picture;
 $("file").onchange = (event) => event.target.files[0] && send(event.target.files[0]);
 $("cancel").onclick = () => call(`/jobs/${current}/cancel`, { method: "POST" }).catch(complain);
 $("delete").onclick = async () => {
@@ -124,5 +165,10 @@ for (const [name, on] of [["dragover", true], ["dragleave", false], ["drop", fal
   });
 }
 window.onhashchange = () => { const id = location.hash.slice(1); if (id && id !== current) watch(id); };
-list();
+$("login").onsubmit = (event) => {
+  event.preventDefault();
+  sessionStorage.key = $("key").value;
+  list().then(() => complain(null), complain);
+};
+list().catch(complain);
 if (location.hash) watch(location.hash.slice(1));

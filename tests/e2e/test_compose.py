@@ -39,12 +39,19 @@ def stages() -> list[list[tuple[str, str]]]:
     return found
 
 
-def test_it_has_the_three_services_and_two_volumes(compose: dict[str, Any]) -> None:
-    assert set(compose["services"]) == {"api", "worker", "redis"}
-    assert set(compose["volumes"]) == {"data", "queue"}
+def test_it_has_three_services_and_more_by_profile(compose: dict[str, Any]) -> None:
+    profiles = {name: service.get("profiles", []) for name, service in compose["services"].items()}
+    assert profiles == {
+        "api": [],
+        "worker": [],
+        "redis": [],
+        "postgres": ["scale"],
+        "worker-gpu": ["scale-gpu"],
+    }
+    assert set(compose["volumes"]) == {"data", "queue", "postgres"}
 
 
-@pytest.mark.parametrize("name", ["api", "worker", "redis"])
+@pytest.mark.parametrize("name", ["api", "worker", "redis", "postgres", "worker-gpu"])
 def test_every_service_is_locked_down_limited_and_watched(compose: dict[str, Any], name: str) -> None:
     service = compose["services"][name]
     user, _, group = service["user"].partition(":")
@@ -65,16 +72,22 @@ def test_every_service_is_locked_down_limited_and_watched(compose: dict[str, Any
 
 def test_only_the_api_is_published_and_only_on_loopback(compose: dict[str, Any]) -> None:
     ports = {name: service.get("ports", []) for name, service in compose["services"].items()}
-    assert ports == {"api": ["127.0.0.1:${MASS_PORT:-8000}:8000"], "worker": [], "redis": []}
-    assert compose["networks"]["queue"]["internal"] is True
-    assert compose["services"]["worker"]["networks"] == ["queue"]
-    assert compose["services"]["redis"]["networks"] == ["queue"]
+    assert ports.pop("api") == ["127.0.0.1:${MASS_PORT:-8000}:8000"]
+    assert not any(ports.values())
+    assert compose["networks"]["queue"]["internal"] == "${MASS_ISOLATED:-true}"
+    for name in ports:
+        assert compose["services"][name]["networks"] == ["queue"]
 
 
 def test_api_and_worker_share_one_image_user_volume_and_broker(compose: dict[str, Any]) -> None:
     api, worker = (compose["services"][name] for name in OURS)
-    for key in ("image", "build", "user", "volumes", "depends_on", "environment"):
+    for key in ("image", "build", "user", "volumes", "depends_on"):
         assert api[key] == worker[key]
+    shared = {name: value for name, value in worker["environment"].items() if name != "MASS_WORKER_QUEUES"}
+    assert api["environment"] == {**shared, "MASS_AUTH": "${MASS_AUTH:-open}"}
+    gpu = compose["services"]["worker-gpu"]
+    assert {**shared, **gpu["environment"]} == gpu["environment"]
+    assert gpu["environment"]["MASS_WORKER_QUEUES"] == '["gpu"]'
     assert api["volumes"] == ["data:/data"]
     assert api["depends_on"] == {"redis": {"condition": "service_healthy"}}
     host = re.fullmatch(r"redis://([^:/]+):6379/0", api["environment"]["MASS_REDIS_URL"])
@@ -114,7 +127,9 @@ def test_every_variable_set_is_one_that_is_read(
     in_image = [
         word.partition("=")[0] for step, rest in stages[-1] if step == "ENV" for word in shlex.split(rest)
     ]
-    in_compose = [name for service in OURS for name in compose["services"][service]["environment"]]
+    in_compose = [
+        name for service in (*OURS, "worker-gpu") for name in compose["services"][service]["environment"]
+    ]
     assert {name for name in [*in_image, *in_compose] if name.startswith("MASS_")} <= known
     assert {"MASS_DATA_DIR", "MASS_MODEL_DIR"} <= set(in_image)
 
@@ -139,3 +154,13 @@ def test_the_build_sees_exactly_what_it_copies(stages: list[list[tuple[str, str]
     assert {line[1:] for line in ignore if line.startswith("!")} == copied
     for name in copied:
         assert (REPOSITORY / name).exists()
+
+
+def test_the_example_of_scaled_settings_sets_what_compose_reads(compose: dict[str, Any]) -> None:
+    lines = (REPOSITORY / "scale.env.example").read_text().splitlines()
+    values = dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
+    read = set(re.findall(r"\$\{(\w+):-", (REPOSITORY / "docker-compose.yml").read_text()))
+    assert set(values) <= read
+    Settings(worker_queues=yaml.safe_load(values["MASS_WORKER_QUEUES"]))
+    assert values["MASS_DATABASE_URL"].endswith("@postgres/mass")
+    assert "postgres" in compose["services"]

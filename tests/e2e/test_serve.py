@@ -33,11 +33,14 @@ class Served:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.data = root / "data"
+        self.notebook = root / "notes"
+        self.notebook.mkdir(exist_ok=True)
         self.output = root / f"serve-{len([*root.glob('serve-*')])}.log"
         clean = {name: value for name, value in os.environ.items() if not name.startswith("MASS_")}
         self.environment = {
             **clean,
             "MASS_ENGINE_COMMAND": json.dumps([sys.executable, str(FAKE_ENGINE)]),
+            "MASS_ENGINE_PATHS": json.dumps([str(self.notebook)]),
             "MASS_MIN_FREE_BYTES": "0",
             "MASS_LEASE_SECONDS": "4",
             "MASS_HEARTBEAT_SECONDS": "0.5",
@@ -76,15 +79,15 @@ class Served:
         return wait_for(f"there is a {words!r} process", find)
 
     def video(self, mode: str = "succeed", gated: bool = False) -> Path:
-        plan = {"mode": mode, "log": str(self.root / "engine.log")}
+        plan = {"mode": mode, "log": str(self.notebook / "engine.log")}
         if gated:
-            plan["gate"] = str(self.root / "gate")
+            plan["gate"] = str(self.notebook / "gate")
         path = self.root / "video.mp4"
         path.write_bytes(MP4 + b"PLAN:" + json.dumps(plan).encode())
         return path
 
     def starts(self) -> list[int]:
-        log = self.root / "engine.log"
+        log = self.notebook / "engine.log"
         lines = [line.split() for line in log.read_text().splitlines()] if log.exists() else []
         return [int(pid) for word, pid, _ in lines if word == "start"]
 
@@ -160,7 +163,7 @@ def test_each_part_is_started_again_when_it_is_killed(served: Served) -> None:
             pid = served.child(words)
             os.kill(pid, signal.SIGKILL)
             wait_for(f"{words} runs again", lambda words=words, pid=pid: served.child(words) != pid)  # type: ignore[misc]
-        (served.root / "gate").touch()
+        (served.notebook / "gate").touch()
         job = client.wait(job.id, poll_seconds=0.1)
         assert (job.state, job.attempt) == ("succeeded", 2)
         assert len(served.starts()) == 2
@@ -179,7 +182,7 @@ def test_kill_9_of_the_supervisor_ends_all_and_the_next_one_finishes_the_job(roo
         everyone = first.everyone()
         first.close()
         wait_for("all of its processes are gone", lambda: not [pid for pid in everyone if alive(pid)])
-        (root / "gate").touch()
+        (root / "notes" / "gate").touch()
         second = Served(root)
         with MassClient(second.url) as client:
             assert client.wait(job.id, poll_seconds=0.1).state == "succeeded"

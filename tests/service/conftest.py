@@ -82,7 +82,7 @@ def serve(settings: Settings) -> Iterator[Live]:
     try:
         # The socket listens already: the first request waits there until the app has started.
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as http:
-            assert http.get("/healthz").json() == {"status": "ok"}
+            assert http.get("/healthz").json() == {"status": "ok"}, "it has started"
             yield Live(http, app.state.services, "127.0.0.1", port)
     finally:
         server.should_exit = True
@@ -96,6 +96,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
         data_dir=tmp_path_factory.mktemp("data"),
         max_upload_bytes=1_000_000,
         min_free_bytes=0,
+        max_open_uploads=0,
         render_queue=1,
         render_timeout=3.0,
         render_load_timeout=20.0,

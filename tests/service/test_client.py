@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import io
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import ClassVar
 
 import httpx
 import pytest
 
 from service.cli import main
 from service.client import AssetInfo, MassClient, ServiceError
+from service.transfers import upload
+from tests.service.conftest import VIDEO, Live
 
 JOB = {
     "id": "j",
@@ -159,7 +164,155 @@ def test_the_local_file_name_is_not_sent(tmp_path: Path) -> None:
         bodies.append(request.read())
         return httpx.Response(202, json=JOB)
 
-    client(answer).submit(video, {"seed": 1})
+    client(answer).submit(video, {"seed": 1}, resumable=False)
     assert b"video bytes" in bodies[0]
     assert b'{"seed": 1}' in bodies[0]
     assert b"holiday" not in bodies[0]
+
+
+class Flaky(httpx.HTTPTransport):
+    """A network on which every third request is lost, or its answer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        self.count += 1
+        if self.count % 6 == 2:
+            raise httpx.ConnectError("lost on the way")
+        answer = super().handle_request(request)
+        if self.count % 6 == 5:
+            answer.close()
+            raise httpx.ReadError("the answer was lost")
+        return answer
+
+
+def test_an_upload_gets_through_a_bad_network(live: Live, tmp_path: Path) -> None:
+    seen: list[int] = []
+    content = VIDEO * 3
+    with MassClient(f"http://{live.host}:{live.port}", transport=Flaky()) as service:
+        upload_id = upload(
+            service._request,
+            io.BytesIO(content),
+            len(content),
+            lambda done, total: seen.append(done),
+            part_bytes=1500,
+            pause=0.0,
+        )
+    found = live.services.uploads.get(upload_id)
+    assert found is not None
+    assert found.complete
+    assert (live.services.storage.root / "uploads" / upload_id / "source").read_bytes() == content
+    assert seen[-1] == len(content)
+    assert seen == sorted(seen)
+
+
+def test_a_submission_whose_answer_was_lost_makes_one_job(live: Live, tmp_path: Path) -> None:
+    class Deaf(httpx.HTTPTransport):
+        lost = 0
+
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            answer = super().handle_request(request)
+            if request.url.path == "/jobs" and self.lost < 2:
+                self.lost += 1
+                answer.close()
+                raise httpx.ReadError("the answer was lost")
+            return answer
+
+    video = tmp_path / "clip.mp4"
+    video.write_bytes(VIDEO)
+    before = len(live.http.get("/jobs?limit=100").json()["jobs"])
+    with MassClient(f"http://{live.host}:{live.port}", transport=Deaf()) as service:
+        job = service.submit(video, {"side": "left"})
+        assert job.state == "queued"
+        assert len([*service.jobs()]) == before + 1
+        again = service.cancel(job.id)
+        assert again.finished
+        second = service.restart(job.id, {"side": "right"})
+        assert second.id != job.id
+
+
+def test_events_are_taken_up_where_the_connection_broke(live: Live) -> None:
+    job_id = live.submit()
+    claim = live.services.store.claim(job_id)
+    assert claim is not None
+    for step in range(1, 6):
+        live.services.store.report_progress(job_id, claim.token, "fit", step / 10)
+    live.services.store.log(job_id, claim.token, ["one", "two"])
+    live.services.store.fail(job_id, claim.token, "c", "m", "a")
+
+    class Cutting(httpx.HTTPTransport):
+        asked: ClassVar[list[str]] = []
+
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            answer = super().handle_request(request)
+            if "/events" not in request.url.path:
+                return answer
+            self.asked.append(request.headers["Last-Event-ID"])
+            return httpx.Response(200, stream=_Cut(answer.read().split(b"\n\n")[:4]))
+
+    with MassClient(f"http://{live.host}:{live.port}", transport=Cutting()) as service:
+        seen = [*service.events(job_id)]
+        assert [*service.logs(job_id)] == ["one", "two"]
+    assert [event.id for event in seen] == [*range(1, 9)]
+    assert seen[-1].data["state"] == "failed"
+    assert Cutting.asked == ["0", "3", "6"]
+
+
+class _Cut(httpx.SyncByteStream):
+    """Some events, then a broken connection."""
+
+    def __init__(self, events: list[bytes]) -> None:
+        self._events = events
+
+    def __iter__(self) -> Iterator[bytes]:
+        for event in self._events:
+            yield event + b"\n\n"
+        raise httpx.ReadError("cut")
+
+
+def test_the_key_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: list[str] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        sent.append(request.headers.get("Authorization", ""))
+        return httpx.Response(200, json=JOB)
+
+    monkeypatch.setenv("MASS_KEY", "mass_x_y")
+    client(answer).job("j")
+    monkeypatch.delenv("MASS_KEY")
+    client(answer).job("j")
+    assert sent == ["Bearer mass_x_y", ""]
+
+
+def test_the_command_line_animates(live: Live, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A worker that makes the motion at once stands in for the real one."""
+    parent, _ = live.finished()
+    stop = threading.Event()
+
+    def work() -> None:
+        store, storage = live.services.store, live.services.storage
+        while not stop.wait(0.02):
+            for job in store.page(parent=parent)[0]:
+                claim = store.claim(job.id)
+                if claim is not None:
+                    assert claim.options["poses"] == ["rest", "fist"]
+                    name = f"motion.{claim.options['format']}"
+                    (storage.attempt_dir(job.id, claim.artifact) / name).write_bytes(b"a motion")
+                    storage.publish(job.id, claim.artifact)
+                    store.succeed(job.id, claim.token, claim.artifact)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        out = tmp_path / "hand.webp"
+        url = f"http://{live.host}:{live.port}"
+        command = ["animate", parent, "--url", url, "--poses", "rest;fist", "--out", str(out)]
+        assert main(command) == 0
+    finally:
+        stop.set()
+        thread.join()
+    assert out.read_bytes() == b"a motion"
+    assert [path.name for path in tmp_path.iterdir()] == ["hand.webp"]
+    assert live.services.store.page(parent=parent)[0] == []

@@ -21,7 +21,7 @@ def test_the_message_is_a_hint_in_json_and_nothing_else() -> None:
         assert queue.publish("a-job-id")
         queue.close()
         with redis.Redis(unix_socket_path=broker.url.split("://")[1]) as client:
-            (message,) = client.lrange("mass:mass", 0, -1)
+            (message,) = client.lrange("mass:cpu", 0, -1)
     sent = json.loads(message)
     assert sent["content-type"] == "application/json"
     assert sent["headers"]["task"] == TASK

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 import mass_engine.channels
 from service.pictures import Channel
 from service.rendering import RenderRefusedError, load_avatar
+from service.storage import OUTPUTS, missing_outputs
 from tests.engine.avatars import small_avatar
 from tests.service.conftest import Live, problem
 
@@ -63,6 +64,29 @@ def test_the_picture_depends_on_the_channel(live: Live, job: tuple[str, Path]) -
     plain, depth = (get(live, job[0], channel=name).headers["etag"] for name in ("rgb", "depth"))
     assert plain != depth
     assert get(live, job[0]).headers["etag"] == plain
+
+
+def test_either_hand_of_a_job_for_both(live: Live, job: tuple[str, Path]) -> None:
+    both, _ = live.finished(
+        **{f"{hand}/{name}": b"x" + hand.encode() for hand in ("left", "right") for name in OUTPUTS}
+    )
+    pictures = {hand: get(live, both, hand=hand).content for hand in ("left", "right")}
+    assert len(set(pictures.values())) == 2
+    assert get(live, both).content == pictures["right"]
+    names = {asset["name"] for asset in live.http.get(f"/jobs/{both}/assets").json()["assets"]}
+    assert {"left/avatar.safetensors", "right/surfels.ply"} < names
+    assert live.http.get(f"/jobs/{both}/assets/left/surfels.ply").content == b"xleft"
+    problem(get(live, job[0], hand="left"), 404, "render.no_hand")
+
+
+def test_what_an_attempt_for_both_hands_must_leave(tmp_path: Path) -> None:
+    assert missing_outputs(tmp_path) == [*OUTPUTS, "report.json"]
+    (tmp_path / "right").mkdir()
+    for name in OUTPUTS:
+        (tmp_path / "right" / name).touch()
+    assert missing_outputs(tmp_path) == ["report.json"]
+    (tmp_path / "left").mkdir()
+    assert missing_outputs(tmp_path) == [*(f"left/{name}" for name in OUTPUTS), "report.json"]
 
 
 def test_the_engine_makes_every_channel(tmp_path: Path) -> None:

@@ -9,6 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from service.jobs import journal
+from service.jobs.idempotency import (
+    REMEMBERED,
+    RESERVED,
+    IdempotencyKeys,
+    Made,
+    Reservation,
+    ReservationLostError,
+    parse_key,
+)
 from service.jobs.model import JobState, is_job_id, new_job_id
 from service.jobs.store import Cancel, Claim, Heartbeat, JobStore, create_store
 from service.settings import Settings
@@ -214,8 +224,8 @@ def test_success_names_the_artifact_and_clears_the_lease(store: JobStore) -> Non
 
 def test_cancel_queued_running_twice_and_after_the_end(store: JobStore) -> None:
     queued = store.create({}, "v")
-    assert store.request_cancel(queued.id) == Cancel.CANCELLED
-    assert store.request_cancel(queued.id) == Cancel.FINISHED
+    for _ in range(2):
+        assert store.request_cancel(queued.id) == Cancel.CANCELLED
     assert store.claim(queued.id) is None
 
     running = store.create({}, "v")
@@ -226,6 +236,10 @@ def test_cancel_queued_running_twice_and_after_the_end(store: JobStore) -> None:
     assert not store.succeed(running.id, claim.token, claim.artifact)
     assert store.finish_cancel(running.id, claim.token)
     assert state(store, running.id) == JobState.CANCELLED
+    done = store.create({}, "v")
+    claim = claimed(store, done.id)
+    assert store.succeed(done.id, claim.token, claim.artifact)
+    assert store.request_cancel(done.id) == Cancel.FINISHED
     assert store.request_cancel(new_job_id()) == Cancel.UNKNOWN
 
 
@@ -315,3 +329,81 @@ def test_jobs_survive_closing_and_opening_the_database(tmp_path: Path) -> None:
     assert found is not None
     assert found.options == {"seed": 3}
     second.close()
+
+
+def test_an_awaited_upload_arrives_is_refused_or_expires(store: JobStore) -> None:
+    arrives, refused, late = (store.create({}, "v", awaits_upload=True) for _ in range(3))
+    assert store.claim(arrives.id) is None
+    assert store.upload_arrived(arrives.id, 9)
+    assert not store.upload_arrived(arrives.id, 9)
+    assert claimed(store, arrives.id).attempt == 1
+    assert store.upload_refused(refused.id, "video.empty", "m", "a")
+    assert store.expire_upload(late.id)
+    assert not store.expire_upload(arrives.id)
+    assert [state(store, job.id) for job in (arrives, refused, late)] == ["running", "failed", "expired"]
+
+
+def test_an_owner_sees_only_their_own(store: JobStore) -> None:
+    mine, theirs = store.create({}, "v", owner="ann"), store.create({}, "v", owner="bob")
+    assert store.get(mine.id, "bob") is None
+    assert store.get(theirs.id, "bob") is not None
+    assert [job.id for job in store.page(owner="ann")[0]] == [mine.id]
+    store.request_cancel(mine.id)
+    assert [job.id for job in store.page(states=[JobState.QUEUED])[0]] == [theirs.id]
+
+
+def test_time_spent_is_booked_whichever_way_a_worker_lets_go(store: JobStore, clock: Clock) -> None:
+    job = store.create({}, "v")
+    claim = claimed(store, job.id)
+    clock.now += 10
+    store.release(job.id, claim.token)
+    clock.now += 100
+    claimed(store, job.id)
+    clock.now += 61
+    claim = claimed(store, job.id)  # taken over
+    clock.now += 5
+    store.request_cancel(job.id)
+    store.finish_cancel(job.id, claim.token)
+    found = store.get(job.id)
+    assert found is not None
+    assert found.busy_seconds == 76
+
+
+def test_log_lines_are_bounded_and_only_the_holder_writes(store: JobStore) -> None:
+    job = store.create({}, "v")
+    assert not store.log(job.id, "stranger", ["x"])
+    claim = claimed(store, job.id)
+    assert store.log(job.id, claim.token, ["one", "t" * 5000])
+    first, second = store.logs(job.id)
+    assert (first.text, len(second.text), second.attempt) == ("one", journal.MAX_LINE, 1)
+    assert [line.id for line in store.logs(job.id, after=first.id)] == [second.id]
+    assert store.log(job.id, claim.token, ["m"] * journal.MAX_LINES)
+    assert len(store.logs(job.id, limit=2 * journal.MAX_LINES)) == journal.MAX_LINES
+
+
+def test_a_key_makes_one_job_whatever_happens_to_its_requests(tmp_path: Path, clock: Clock) -> None:
+    store = create_store(Settings(data_dir=tmp_path), clock)
+    keys = IdempotencyKeys(store.engine, clock)
+    slow = keys.reserve("ann", "k")
+    assert isinstance(slow, Reservation)
+    assert keys.reserve("ann", "k") is None
+    assert isinstance(keys.reserve("bob", "k"), Reservation)
+    clock.now += RESERVED + 1
+    retry = keys.reserve("ann", "k")
+    assert isinstance(retry, Reservation)
+    job = store.create({}, "v", owner="ann", idempotency_key=(retry, "f"))
+    with pytest.raises(ReservationLostError):
+        store.create({}, "v", owner="ann", idempotency_key=(slow, "f"))
+    assert [found.id for found in store.page(owner="ann")[0]] == [job.id]
+    keys.release(retry)
+    keys.sweep()
+    assert keys.reserve("ann", "k") == Made(job.id, "f")
+    clock.now += REMEMBERED + 1
+    assert isinstance(keys.reserve("ann", "k"), Reservation)
+    store.close()
+
+
+@pytest.mark.parametrize("header", ["", " ", "a b", "\u00fc", "x" * 129, '"a"b"'])
+def test_what_is_no_idempotency_key(header: str) -> None:
+    assert parse_key(header) is None
+    assert parse_key('"abc"') == parse_key("abc") == "abc"

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from service.jobs.model import FINAL_STATES, TRANSITIONS, Job, JobState, sources
-from service.jobs.store import Heartbeat, create_store
+from service.jobs.model import FINAL_STATES, HELD_STATES, TRANSITIONS, Job, JobState, sources
+from service.jobs.store import Cancel, Heartbeat, create_store
 from service.settings import Settings
 
 MAX_ATTEMPTS = 3
@@ -19,11 +20,11 @@ LEASE = 60.0
 
 def test_the_table_is_closed_and_its_ends_are_ends() -> None:
     assert set(TRANSITIONS) == set(JobState)
-    assert {JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED} == FINAL_STATES
+    assert {"succeeded", "failed", "cancelled", "expired"} == FINAL_STATES
     for state, after in TRANSITIONS.items():
         for target in after:
             assert state in sources(target)
-    reached = {JobState.QUEUED}
+    reached = {JobState.AWAITING_UPLOAD}
     while more := {t for s in reached for t in TRANSITIONS[s]} - reached:
         reached |= more
     assert reached == set(JobState)
@@ -32,16 +33,17 @@ def test_the_table_is_closed_and_its_ends_are_ends() -> None:
 class JobLife(RuleBasedStateMachine):
     """One job, any number of workers with fresh and stale tokens, a user, a reconciler and a clock."""
 
-    @initialize()
-    def begin(self) -> None:
+    @initialize(awaits=st.booleans())
+    def begin(self, awaits: bool) -> None:
         self.folder = tempfile.TemporaryDirectory()
         self.now = 1_000.0
         settings = Settings(data_dir=Path(self.folder.name), max_attempts=MAX_ATTEMPTS)
         self.store = create_store(settings, lambda: self.now)
-        self.id = self.store.create({}, "v").id
+        self.id = self.store.create({}, "v", awaits_upload=awaits).id
         self.tokens = ["never-issued"]
         self.before = self.row()
         self.published = 0
+        self.entries = 1
 
     def teardown(self) -> None:
         if hasattr(self, "store"):
@@ -71,7 +73,7 @@ class JobLife(RuleBasedStateMachine):
             and before.lease_until < self.now
         )
         claim = self.store.claim(self.id, lease_seconds=LEASE)
-        allowed = free and not before.cancel_requested and before.attempt < MAX_ATTEMPTS
+        allowed = free and before.attempt < MAX_ATTEMPTS
         assert (claim is not None) == allowed
         if claim is not None:
             self.tokens.append(claim.token)
@@ -101,6 +103,8 @@ class JobLife(RuleBasedStateMachine):
                 allowed = not before.cancel_requested
             case "fail":
                 done, allowed = self.store.fail(self.id, token, "c", "m", "a"), True
+                if done and before.state == JobState.CANCELLING:
+                    assert self.row().state == JobState.CANCELLED
             case "release":
                 done, allowed = self.store.release(self.id, token), True
             case "crash":
@@ -111,7 +115,27 @@ class JobLife(RuleBasedStateMachine):
 
     @rule()
     def user_cancels(self) -> None:
-        self.store.request_cancel(self.id)
+        before = self.row().state
+        said = self.store.request_cancel(self.id)
+        match before:
+            case JobState.AWAITING_UPLOAD | JobState.QUEUED | JobState.CANCELLED:
+                assert (said, self.row().state) == (Cancel.CANCELLED, JobState.CANCELLED)
+            case JobState.RUNNING | JobState.CANCELLING:
+                assert (said, self.row().state) == (Cancel.REQUESTED, JobState.CANCELLING)
+            case _:
+                assert (said, self.row().state) == (Cancel.FINISHED, before)
+
+    @rule(how=st.sampled_from(["arrives", "expires", "refused"]))
+    def upload_ends(self, how: str) -> None:
+        before = self.row().state
+        match how:
+            case "arrives":
+                done = self.store.upload_arrived(self.id, 7)
+            case "expires":
+                done = self.store.expire_upload(self.id)
+            case _:
+                done = self.store.upload_refused(self.id, "video.unsupported_container", "m", "a")
+        assert done == (before == JobState.AWAITING_UPLOAD)
 
     @rule()
     def reconcile(self) -> None:
@@ -128,14 +152,30 @@ class JobLife(RuleBasedStateMachine):
         if before.state != after.state:
             assert after.state in TRANSITIONS[before.state]
         assert 0 <= after.attempt <= MAX_ATTEMPTS
-        assert (after.token is not None) == (after.state == JobState.RUNNING)
+        assert (after.token is not None) == (after.state in HELD_STATES)
         assert (after.finished_at is not None) == (after.state in FINAL_STATES)
         assert (after.artifact is not None) == (after.state == JobState.SUCCEEDED)
         assert (after.error_code is not None) == (after.state == JobState.FAILED)
         assert self.published <= 1
         if after.state == JobState.QUEUED:
-            assert not after.cancel_requested
             assert after.attempt < MAX_ATTEMPTS
+
+    @invariant()
+    def the_journal_tells_it_all_in_order(self) -> None:
+        if not hasattr(self, "store"):
+            return
+        row, new = self.row(), self.store.events(self.id, self.entries - 1)
+        entries = self.store.events(self.id)
+        assert [entry.seq for entry in entries] == [*range(1, row.event_seq + 1)]
+        assert new == entries[self.entries - 1 :]
+        self.entries = len(entries)
+        assert entries[-1].data["state"] == row.state
+        for one, two in pairwise(entries):
+            assert (
+                two.data["state"] == one.data["state"] or two.data["state"] in TRANSITIONS[one.data["state"]]
+            )
+            again = two.data["attempt"] > one.data["attempt"] or two.kind == "state"
+            assert again or two.data["fraction"] >= one.data["fraction"]
 
 
 TestJobLife = JobLife.TestCase

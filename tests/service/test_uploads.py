@@ -113,7 +113,10 @@ def test_exactly_the_limit_is_accepted(live: Live) -> None:
 
 
 def test_a_body_that_is_no_form_is_refused(live: Live) -> None:
-    problem(live.http.post("/jobs", json={"video": "x"}), 415, "request.media_type")
+    problem(live.http.post("/jobs", json={"video": "x"}), 422, "request.invalid")
+    too_long = {"upload": "x", "options": {"side": "x" * 100_000}}
+    problem(live.http.post("/jobs", json=too_long), 413, "upload.too_large")
+    problem(live.http.post("/jobs", json={"upload": "x"}), 404, "upload.not_found")
     problem(live.http.post("/jobs", content=VIDEO), 415, "request.media_type")
     problem(
         live.http.post("/jobs", content=VIDEO, headers={"Content-Type": "multipart/form-data"}),

@@ -1,7 +1,8 @@
 """A program with the engine's command line that does what the "video" tells it to.
 
 The video file ends with ``PLAN:`` and a JSON object: ``mode`` (see main), ``gate`` (a file to wait for before
-the end) and ``log`` (a file that gets one line at the start and one at the end of each run).
+the end), ``log`` (a file that gets one line at the start and one at the end of each run) and ``seconds`` of
+idleness before the end.
 """
 
 from __future__ import annotations
@@ -33,17 +34,45 @@ def wait_for_gate(plan: dict[str, Any]) -> None:
         time.sleep(0.01)
 
 
+def work_in_steps(plan: dict[str, Any], run: Path, resume: bool) -> None:
+    """Ten steps with a checkpoint after each, as an engine does it; halfway it waits for the gate."""
+    state = run / "checkpoint" / "state.json"
+    first = json.loads(state.read_text())["next"] if resume else 0
+    state.parent.mkdir(exist_ok=True)
+    for step in range(first, 10):
+        note(plan, f"step:{step}", run)
+        written = state.with_suffix(".new")
+        written.write_text(json.dumps({"next": step + 1}))
+        written.replace(state)
+        if step == 4:
+            note(plan, "halfway", run)
+            wait_for_gate(plan)
+        if step >= 6 and plan.get("crash_late"):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("command", choices=["fit"])
     parser.add_argument("video", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--json", action="store_true", required=True)
-    for flag in ("--preset", "--side", "--seed", "--fov", "--max-frames", "--holdout"):
+    parser.add_argument("--resume", action="store_true")
+    for flag in (
+        "--preset",
+        "--side",
+        "--seed",
+        "--fov",
+        "--max-frames",
+        "--holdout",
+        "--device",
+        "--max-seconds",
+    ):
         parser.add_argument(flag)
     options = parser.parse_args()
     plan: dict[str, Any] = json.loads(options.video.read_bytes().rpartition(b"PLAN:")[2])
     run: Path = options.out
+    note(plan, "resume" if options.resume else "begin", run)
     note(plan, "start", run)
     say(type="progress", stage="track", fraction=0.25, time_left=3.0, message="frame 1 of 4")
     match plan["mode"]:
@@ -60,6 +89,24 @@ def main() -> int:
             return 2
         case "empty":
             return 0
+        case "steps":
+            work_in_steps(plan, run, options.resume)
+            plan.pop("gate", None)
+        case "canary":
+            canary: str = plan["canary"]
+            (run / "checkpoint").mkdir(exist_ok=True)
+            (run / "checkpoint" / "state.json").write_text(json.dumps({"next": 1, "canary": canary}))
+            (run / "tracks.json").write_text(json.dumps(canary))
+            say(type="warning", code="w", message=canary, advice="")
+            say(type="progress", stage="fit", fraction=0.5, time_left=1.0, message=canary)
+        case "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        case "memory":
+            (run / "surfels.ply").write_bytes(bytes(1 << 40))
+        case "fill":
+            with (run / "surfels.ply").open("wb") as file:
+                while True:
+                    file.write(bytes(1 << 20))
         case "stubborn":
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
             note(plan, "deaf", run)
@@ -73,6 +120,7 @@ def main() -> int:
             say(type="progress", stage=7, fraction="much", time_left=float("nan"), message=None)
             say(type="progress", stage="fit", fraction=1e9, time_left=-1, message="m" * 5000)
     wait_for_gate(plan)
+    time.sleep(plan.get("seconds", 0.0))
     for name, content in FILES.items():
         (run / name).write_bytes(content)
     note(plan, "end", run)

@@ -102,6 +102,9 @@ class Bench:
 
     def __init__(self, **overrides: Any) -> None:
         self.root = Path(tempfile.mkdtemp(prefix="mass-test-", dir="/tmp"))
+        #: The only folder here that engines may write besides their run directories.
+        self.notebook = self.root / "notes"
+        self.notebook.mkdir()
         values: dict[str, Any] = {
             "data_dir": self.root / "data",
             "engine_command": [sys.executable, str(FAKE_ENGINE)],
@@ -110,6 +113,7 @@ class Bench:
             "reconcile_seconds": 0.5,
             "republish_min_seconds": 1.0,
             "min_free_bytes": 0,
+            "engine_paths": [self.notebook],
             **overrides,
         }
         self.broker = EmbeddedBroker(values["data_dir"])
@@ -135,14 +139,14 @@ class Bench:
         environment = {name: value for name, value in os.environ.items() if not name.startswith("MASS_")}
         for name in self.settings.model_fields_set:
             value = getattr(self.settings, name)
-            text = json.dumps(value) if isinstance(value, list) else str(value)
+            text = json.dumps(value, default=str) if isinstance(value, list) else str(value)
             environment[f"MASS_{name.upper()}"] = text
         return {**environment, "CANARY_SECRET": "c4n4ry"}
 
-    def worker(self) -> Worker:
+    def worker(self, **environment: str) -> Worker:
         """Start one more worker process; not waited for."""
         log = self.root / f"worker-{len(self.workers)}.log"
-        self.workers.append(Worker(self.settings, self.environment(), log))
+        self.workers.append(Worker(self.settings, {**self.environment(), **environment}, log))
         return self.workers[-1]
 
     def kill_broker(self) -> None:
@@ -156,32 +160,48 @@ class Bench:
 
     # Jobs
 
-    def job(self, mode: str = "succeed", gated: bool = False, options: dict[str, Any] | None = None) -> str:
+    def job(
+        self,
+        mode: str = "succeed",
+        gated: bool = False,
+        options: dict[str, Any] | None = None,
+        queue: str = "cpu",
+        restarted_from: str | None = None,
+        **more: Any,
+    ) -> str:
         """A queued row with its video, not published. ``gated``: the engine waits for :meth:`open_gate`."""
         job_id = new_job_id()
-        plan = {"mode": mode, "log": str(self.root / f"{job_id}.log")}
+        plan = {"mode": mode, "log": str(self.notebook / f"{job_id}.log"), **more}
         if gated:
-            plan["gate"] = str(self.root / f"{job_id}.gate")
+            plan["gate"] = str(self.notebook / f"{job_id}.gate")
         self.storage.begin_upload(job_id).write_bytes(b"PLAN:" + json.dumps(plan).encode())
         video = self.storage.finish_upload(job_id)
-        self.store.create(options or {}, video, job_id=job_id)
+        self.store.create(options or {}, video, job_id=job_id, queue=queue, restarted_from=restarted_from)
+        return job_id
+
+    def submit_file(self, video: Path) -> str:
+        """Submit a real video file."""
+        job_id = new_job_id()
+        shutil.copy(video, self.storage.begin_upload(job_id))
+        self.store.create({}, self.storage.finish_upload(job_id), job_id=job_id)
+        assert self.publish(job_id)
         return job_id
 
     def publish(self, job_id: str) -> bool:
         """What the API does after creating the row."""
-        return self.queue.publish(job_id) and self.store.mark_published(job_id)
+        return self.queue.publish(job_id, self.row(job_id).queue) and self.store.mark_published(job_id)
 
-    def submit(self, mode: str = "succeed", gated: bool = False) -> str:
-        job_id = self.job(mode, gated)
+    def submit(self, mode: str = "succeed", gated: bool = False, **more: Any) -> str:
+        job_id = self.job(mode, gated, **more)
         assert self.publish(job_id)
         return job_id
 
     def open_gate(self, job_id: str) -> None:
-        (self.root / f"{job_id}.gate").touch()
+        (self.notebook / f"{job_id}.gate").touch()
 
     def notes(self, job_id: str, word: str) -> list[tuple[int, str]]:
         """(pid, attempt directory) of each time the engine wrote ``word`` about the job."""
-        log = self.root / f"{job_id}.log"
+        log = self.notebook / f"{job_id}.log"
         lines = [line.split() for line in log.read_text().splitlines()] if log.exists() else []
         return [(int(pid), run) for what, pid, run in lines if what == word]
 
@@ -194,7 +214,9 @@ class Bench:
         assert job is not None
         return job
 
-    def when(self, job_id: str, what: str, condition: Callable[[Job], bool]) -> Job:
+    def when(
+        self, job_id: str, what: str, condition: Callable[[Job], bool], deadline: float = DEADLINE
+    ) -> Job:
         """Wait until the row meets ``condition``; a job that ends without meeting it fails at once."""
 
         def check() -> Job | None:
@@ -205,13 +227,18 @@ class Bench:
             return None
 
         try:
-            return wait_for(f"job {job_id} {what}", check)
+            return wait_for(f"job {job_id} {what}", check, deadline)
         except AssertionError as error:
             raise AssertionError(f"{error}\n{self.logs()}") from None
 
-    def until(self, job_id: str, state: str) -> Job:
+    def until(self, job_id: str, state: str, deadline: float = DEADLINE) -> Job:
         """Wait for a state."""
-        return self.when(job_id, f"is {state}", lambda job: job.state == state)
+        return self.when(job_id, f"is {state}", lambda job: job.state == state, deadline)
+
+    def words(self, job_id: str) -> list[str]:
+        """All that its engines wrote, in order."""
+        log = self.notebook / f"{job_id}.log"
+        return [line.split()[0] for line in log.read_text().splitlines()] if log.exists() else []
 
     def engine(self, job_id: str, number: int = 1) -> int:
         """Wait for the ``number``-th start of the job's engine; returns its pid."""

@@ -155,7 +155,7 @@ def test_a_worker_started_without_a_broker_waits_for_it(bench: Bench) -> None:
 
 
 def test_the_time_limit_ends_an_engine_that_does_not() -> None:
-    bench = Bench(job_timeout=1.0)
+    bench = Bench(job_timeout=8.0)
     try:
         bench.worker()
         job_id = bench.submit("stubborn", gated=True)

@@ -38,6 +38,11 @@ def test_a_job_runs_to_success_and_its_files_are_published(running: Bench) -> No
     published = {asset.name: asset.bytes for asset in running.storage.assets(job_id, job.artifact)}
     assert published == {name: len(content) for name, content in FILES.items()}
     assert len(running.starts(job_id)) == 1
+    assert [line.text for line in running.store.logs(job_id)] == ["stage track"]
+    said = [(entry.kind, entry.data["state"]) for entry in running.store.events(job_id)]
+    assert said[:2] == [("state", "queued"), ("state", "running")]
+    assert said[-1] == ("state", "succeeded")
+    assert ("progress", "running") in said
 
 
 def test_the_engine_gets_the_options_and_none_of_the_services_secrets(running: Bench) -> None:
@@ -48,9 +53,11 @@ def test_the_engine_gets_the_options_and_none_of_the_services_secrets(running: B
     assert job.artifact is not None
     seen = json.loads((running.storage.artifact_path(job_id, job.artifact) / "tracks.json").read_text())
     flags = [word for word in seen["argv"] if word.startswith("--") and word != "--out"]
-    assert sorted(flags) == ["--json", "--max-frames=30", "--preset=draft", "--seed=7"]
+    assert sorted(flags) == [
+        *("--json", "--max-frames=30", "--max-seconds=600", "--preset=draft", "--seed=7")
+    ]
     assert "CANARY_SECRET" in running.environment()
-    assert [name for name in seen["env"] if name.startswith(("MASS_", "CANARY"))] == []
+    assert [name for name in seen["env"] if name.startswith(("MASS_", "CANARY"))] == ["MASS_MODEL_DIR"]
 
 
 def test_a_video_the_engine_cannot_use_fails_with_its_code(running: Bench) -> None:
@@ -103,7 +110,7 @@ def test_output_that_is_no_event_does_no_harm(running: Bench) -> None:
 def test_a_process_left_behind_by_the_engine_is_ended_with_it(running: Bench) -> None:
     job_id = running.submit("child")
     running.until(job_id, "succeeded")
-    words = (running.root / f"{job_id}.log").read_text().split()
+    words = (running.notebook / f"{job_id}.log").read_text().split()
     child = next(int(word.split(":")[1]) for word in words if word.startswith("child:"))
     wait_for("the child is gone", lambda: not alive(child))
 
@@ -119,7 +126,7 @@ def test_cancel_ends_a_running_engine(running: Bench, mode: str) -> None:
     job = running.until(job_id, "cancelled")
     assert job.artifact is None
     assert running.notes(job_id, "end") == []
-    assert running.store.request_cancel(job_id) is Cancel.FINISHED
+    assert running.store.request_cancel(job_id) is Cancel.CANCELLED
 
 
 def test_deleting_a_running_job_ends_its_engine_and_leaves_no_file(running: Bench) -> None:

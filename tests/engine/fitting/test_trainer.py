@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from mass_engine.avatar import Avatar, row_pose
 from mass_engine.deform.network import DeformationConfig
 from mass_engine.evaluation.scores import score_view
 from mass_engine.fitting.components import Components
 from mass_engine.fitting.gauss_newton import Round
+from mass_engine.fitting.looks import LOOK_SIDE, Show
 from mass_engine.fitting.schedule import Schedule, schedule_for
 from mass_engine.fitting.subject import Appearance, render_row
 from mass_engine.fitting.surfel_fit import SurfelPass
@@ -42,9 +44,10 @@ def small_schedule() -> Schedule:
     )
 
 
-def fitted(views: list[View]) -> FitResult:
+def fitted(views: list[View], show: Show | None = None) -> FitResult:
     start = perturbed(true_poses(len(views)), 11, 0.05)
-    return fit_hand(views, start, load_builtin("right"), CAMERA, small_schedule(), 0, lambda *_: None)
+    model = load_builtin("right")
+    return fit_hand(views, start, model, CAMERA, small_schedule(), 0, lambda *_: None, show=show)
 
 
 def test_changing_heldout_pixels_changes_no_bit_of_the_avatar() -> None:
@@ -53,7 +56,11 @@ def test_changing_heldout_pixels_changes_no_bit_of_the_avatar() -> None:
     for row in HELDOUT:
         random = np.random.default_rng(row)
         other[row].rgb = random.integers(0, 255, other[row].rgb.shape, np.uint8)
-    one, two = fitted(views).avatar, fitted(other).avatar
+    looks: list[NDArray[np.uint8]] = []
+    one, two = fitted(views, looks.append).avatar, fitted(other).avatar
+    assert 2 < len(looks) <= 11 * len(small_schedule().appearance)
+    assert max(looks[-1].shape) <= LOOK_SIDE
+    assert np.asarray((looks[-1] < 250).mean()) > 0.1  # the hand is there, on white
     for name in ("albedo", "opacity_logits", "sh", "light"):
         assert torch.equal(getattr(one.appearance, name), getattr(two.appearance, name)), name
     assert torch.equal(one.skin.sources, two.skin.sources)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -17,7 +18,7 @@ from urllib.parse import quote
 import httpx
 
 from service.errors import ServiceError
-from service.transfers import BytesProgress, upload
+from service.transfers import BytesProgress, begin, give_up, send
 
 __all__ = ["AssetInfo", "BytesProgress", "EventInfo", "JobError", "JobInfo", "MassClient", "ServiceError"]
 
@@ -116,13 +117,7 @@ class MassClient:
         with video.open("rb") as file:
             size = video.stat().st_size
             if resumable:
-                wish = {
-                    "upload": upload(self._request, file, size, on_progress),
-                    "options": dict(options or {}),
-                }
-                # Sent again after an answer that was lost, the key makes no second job.
-                headers = {"Idempotency-Key": str(uuid.uuid4())}
-                return _job(self._insist("POST", "/jobs", json=wish, headers=headers).json())
+                return self._submit_in_parts(file, size, options, on_progress)
             stream: Any = file if on_progress is None else _Counted(file, size, on_progress)
             return _job(
                 self._request(
@@ -133,6 +128,23 @@ class MassClient:
                     data={"options": json.dumps(dict(options))} if options else None,
                 ).json()
             )
+
+    def _submit_in_parts(
+        self, file: IO[bytes], size: int, options: Mapping[str, Any] | None, tell: BytesProgress | None
+    ) -> JobInfo:
+        """The job first, so that wrong options are told before the video is sent; then its bytes."""
+        upload_id = begin(self._request, size)
+        wish = {"upload": upload_id, "options": dict(options or {})}
+        # Sent again after an answer that was lost, the key makes no second job.
+        headers = {"Idempotency-Key": str(uuid.uuid4())}
+        try:
+            self._insist("POST", "/jobs", json=wish, headers=headers)
+        except ServiceError:
+            with contextlib.suppress(ServiceError):
+                give_up(self._request, upload_id)
+            raise
+        send(self._request, upload_id, file, size, tell)
+        return self.job(upload_id)
 
     def restart(
         self, job_id: str, options: Mapping[str, Any] | None = None, from_stage: str | None = None

@@ -43,8 +43,35 @@ def upload(
     A service or network that is away is waited for, ``patience`` seconds from the last byte that arrived.
     Raises ServiceError.
     """
+    upload_id = begin(ask, size)
+    send(ask, upload_id, file, size, tell, part_bytes=part_bytes, patience=patience, pause=pause)
+    return upload_id
+
+
+def begin(ask: Ask, size: int) -> str:
+    """Make an upload of ``size`` bytes; returns its id. Raises ServiceError."""
     created = ask("POST", "/uploads", headers={**_TUS, "Upload-Length": str(size)})
-    path = created.headers["Location"]
+    return str(created.headers["Location"].rpartition("/")[2])
+
+
+def give_up(ask: Ask, upload_id: str) -> None:
+    """Remove an upload that no job will be made of. Raises ServiceError."""
+    ask("DELETE", f"/uploads/{upload_id}", headers=_TUS)
+
+
+def send(
+    ask: Ask,
+    upload_id: str,
+    file: IO[bytes],
+    size: int,
+    tell: BytesProgress | None,
+    *,
+    part_bytes: int = PART_BYTES,
+    patience: float = 60.0,
+    pause: float = 0.5,
+) -> None:
+    """Send the bytes of an upload; see :func:`upload`. Raises ServiceError."""
+    path = f"/uploads/{upload_id}"
     offset, last = 0, time.monotonic()
     while offset < size:
         file.seek(offset)
@@ -60,7 +87,6 @@ def upload(
             offset = _standing(ask, path, offset)
         if tell is not None:
             tell(offset, size)
-    return str(path.rpartition("/")[2])
 
 
 def _standing(ask: Ask, path: str, known: int) -> int:

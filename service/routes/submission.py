@@ -147,7 +147,9 @@ async def _uploaded(request: Request) -> UploadedJob:
     try:
         return UploadedJob.model_validate_json(body)
     except ValidationError as error:
-        raise ProblemError(Kind.REQUEST_INVALID, errors=field_errors(error.errors())) from error
+        only_options = all(fault["loc"][:1] == ("options",) for fault in error.errors())
+        kind = Kind.OPTIONS_INVALID if only_options else Kind.REQUEST_INVALID
+        raise ProblemError(kind, errors=field_errors(error.errors())) from error
 
 
 @router.post(

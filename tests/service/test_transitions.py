@@ -179,4 +179,4 @@ class JobLife(RuleBasedStateMachine):
 
 
 TestJobLife = JobLife.TestCase
-TestJobLife.settings = hypothesis_settings(max_examples=60, stateful_step_count=30, deadline=None)
+TestJobLife.settings = hypothesis_settings(max_examples=40, stateful_step_count=30, deadline=None)

@@ -448,7 +448,7 @@ class Upload(RuleBasedStateMachine):
 
 
 TestUpload = Upload.TestCase
-TestUpload.settings = hypothesis_settings(max_examples=30, stateful_step_count=20, deadline=None)
+TestUpload.settings = hypothesis_settings(max_examples=20, stateful_step_count=15, deadline=None)
 
 
 def test_the_page_of_headers_is_declared(live: Live) -> None:

@@ -35,6 +35,7 @@ class FitReport:
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_bytes: int = 0
     fit: dict[str, Any] = field(default_factory=dict)
+    curves: dict[str, list[float]] = field(default_factory=dict)
     seed: int = 0
     versions: dict[str, str] = field(default_factory=dict)
     machine: dict[str, Any] = field(default_factory=dict)
@@ -91,6 +92,19 @@ class HandsReport:
     def summary(self) -> str:
         """A few lines for a person."""
         return "\n".join(report.summary() for report in self.hands.values())
+
+
+def curves(notes: dict[str, Any]) -> dict[str, list[float]]:
+    """What fell and rose during a fit, by name, from the fit's own notes (``FitState.notes``)."""
+    pulls: list[dict[str, float]] = notes.get("pull_pixels", [])
+    passes: list[dict[str, float]] = notes.get("stage_two", [])
+    reached = [value for turn in passes for value in (turn["validation_before"], turn["validation_after"])]
+    found = {
+        "pull of the training frames, pixels": [turn["training"] for turn in pulls],
+        "pull of the validation frames, pixels": [turn["validation"] for turn in pulls],
+        "validation PSNR before and after each pass of stage two, dB": [v for v in reached if v == v],
+    }
+    return {name: values for name, values in found.items() if values}
 
 
 def _write_json(data: dict[str, Any], directory: Path) -> None:

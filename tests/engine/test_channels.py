@@ -255,7 +255,8 @@ def test_the_command_line_writes_pictures_and_numbers(avatar: Avatar, run: Path,
         assert np.array_equal(cv2.cvtColor(written, cv2.COLOR_BGRA2RGBA), wanted.picture())
         values = np.load(numbers)
         assert values.dtype == np.float32
-        assert np.array_equal(values, wanted.numbers())
+        # Sums may run in another order in a loaded avatar: the last bit is not promised.
+        np.testing.assert_allclose(values, wanted.numbers(), atol=1e-5, rtol=1e-5)
     assert command(run, tmp_path / "default.png", "--pose", "fist") == 0
     assert (tmp_path / "default.png").read_bytes() == (tmp_path / "rgb.png").read_bytes()
 

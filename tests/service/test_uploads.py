@@ -43,7 +43,7 @@ def test_a_video_becomes_a_queued_job(live: Live) -> None:
     assert is_job_id(body["id"])
     assert answer.headers["location"] == f"/jobs/{body['id']}" == body["links"]["self"]
     assert (body["state"], body["fraction"], body["attempt"], body["error"]) == ("queued", 0.0, 0, None)
-    assert body["options"] == options
+    assert body["options"] == {**options, "device": None}
     assert body["video_bytes"] == len(VIDEO)
     job = live.services.store.get(body["id"])
     assert job is not None
@@ -62,6 +62,7 @@ def test_a_webm_is_accepted_and_options_have_defaults(live: Live) -> None:
         "fov": None,
         "max_frames": None,
         "holdout": None,
+        "device": None,
     }
 
 
@@ -260,7 +261,7 @@ def test_a_broker_that_is_away_does_not_refuse_a_job(live: Live) -> None:
 def test_sending_marks_the_job_published(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     sent: list[str] = []
 
-    def publish(self: JobQueue, job_id: str) -> bool:
+    def publish(self: JobQueue, job_id: str, *_: object) -> bool:
         sent.append(job_id)
         return True
 

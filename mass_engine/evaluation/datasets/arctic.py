@@ -60,7 +60,7 @@ def evaluate(options: EvalOptions, tell: Tell) -> DatasetResult:
         tell(f"{sid}/{name}")
         folder = options.out / f"{sid}-{name}"
         folder.mkdir(parents=True, exist_ok=True)
-        video = folder / "video.mkv"
+        video = folder / "pictures.mkv"
         write_lossless(video, pictures(options.root, sid, name), FPS)
         poses = options.tracks or f"arctic:{options.root / 'raw_seqs' / sid / (name + '.mano.npy')}"
         outcome = fit(

@@ -79,7 +79,7 @@ def evaluate(options: EvalOptions, tell: Tell) -> DatasetResult:
         tracks = _tracks(source, numbers, template, settings)
         write_tracks([tracks], folder / "given.json")
         _write_masks(source, numbers, tracks, template, folder / "masks")
-        video = folder / "video.mkv"
+        video = folder / "pictures.mkv"
         write_lossless(
             video, (_picture(source / "unscreen_cropped" / f"{number:04d}.jpg") for number in numbers), FPS
         )

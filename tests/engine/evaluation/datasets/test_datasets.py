@@ -71,7 +71,7 @@ def test_arctic(tmp_path: Path) -> None:
     assert row["clip"] == "s01/box_grab_01"
     assert [frame["index"] for frame in row["per_frame"]] == [4, 9]
     # The poses are exact: through the lens, the offset and the cameras the hand must lie on the hand.
-    assert row["metrics"]["silhouette_iou"] > 0.9
+    assert row["metrics"]["silhouette_iou"] > 0.86  # preset draft, ten frames
     assert row["metrics"]["psnr_hand_on_black"] > 25
 
 

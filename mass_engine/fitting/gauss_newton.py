@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -40,9 +40,6 @@ from mass_engine.surfel.shading import white_light
 from mass_engine.surfel.subdivision import Subdivision
 from mass_engine.tracking.alignment import hand_size_pixels, interpolate_pose
 from mass_engine.tracking.offsets import tracked_points
-
-#: What one frame (row) says of every surfel's colour: its sum under the blending weights, and these [N,4].
-Gather = Callable[[int], Tensor]
 
 #: Frames whose Jacobians are held at a time.
 CHUNK = 12
@@ -102,7 +99,7 @@ class Registrar:
         self.undone = 0
         self._limits, self._axes = joint_limits().double(), joint_frames(shape.model).double()
         self._edges = mesh_edges(shape.model.faces)
-        self._trained = [row for row, view in enumerate(views) if not view.heldout]
+        self.trained = [row for row, view in enumerate(views) if not view.heldout]
         self._points = torch.stack([torch.from_numpy(view.points) for view in views])
         self._sizes = hand_size_pixels(self._points)
         self._at_joints = torch.tensor([view.at_joints for view in views])
@@ -121,7 +118,7 @@ class Registrar:
         whose silhouette has got clearly worse by its last step goes back to before it, and stays there.
         """
         shared = rows is None
-        chosen = self._trained if rows is None else rows
+        chosen = self.trained if rows is None else rows
         subdivision = binding.subdivision
         targets = self._between(chosen)
         if not motion:
@@ -134,7 +131,7 @@ class Registrar:
         lit: list[LightSample] = []
         for start in range(0, len(chosen), CHUNK):
             part = chosen[start : start + CHUNK]
-            pose = self._poses(part)
+            pose = self.poses(part)
             jacobian = pose_jacobian(self.shape, subdivision, pose)
             of_shape = shape_jacobian(self.shape, subdivision, pose) if shared and stage.betas else None
             with torch.no_grad():
@@ -200,44 +197,8 @@ class Registrar:
         """Rows that were placed anew have no last step."""
         self.memory["overlap"][torch.tensor(rows)] = 0.0
 
-    def sweep(
-        self,
-        stages: Sequence[Round],
-        binding: MeshBinding,
-        gather: Gather,
-        progress: Callable[[float], None] | None = None,
-        memory: float = 0.95,
-    ) -> None:
-        """Register frame after frame, outward from the one that shows most, against the texture so far.
-
-        A texture averaged over badly registered frames is flat and pulls nowhere; one that grows from a
-        single frame is sharp from the start. A frame begins with its neighbour's correction.
-        """
-        trained = self._trained
-        key = max(
-            range(len(trained)), key=lambda place: float((self.views[trained[place]].labels == 255).sum())
-        )
-        total = torch.zeros(binding.count, 4)
-        moved: dict[int, Tensor] = {}
-        for done, place in enumerate(sorted(range(len(trained)), key=lambda place: abs(place - key))):
-            row = trained[place]
-            before = self._poses([row])
-            if place != key:
-                near = moved[place - 1 if place > key else place + 1]
-                self.table.put(torch.tensor([row]), turned(before, near))
-                self.forget([row])
-                known = total[:, 3:] > 0.05
-                mean = total[:, :3].sum(0) / total[:, 3].sum()
-                albedo = torch.where(known, total[:, :3] / total[:, 3:].clamp_min(1e-6), mean)
-                look = replace(Appearance.plain(binding.count, white_light()), albedo=albedo)
-                for stage in stages:
-                    self.step(stage, binding, look, [row], motion=False)
-            moved[place] = difference(before, self._poses([row]))
-            total = total * memory + gather(row)
-            if progress is not None:
-                progress((done + 1) / len(trained))
-
-    def _poses(self, rows: list[int]) -> HandPose:
+    def poses(self, rows: list[int]) -> HandPose:
+        """The rows' poses as they stand (batched)."""
         index = torch.tensor(rows)
         leaves = {name: value[index] for name, value in self.table.values.items()}
         return self.table.pose(self.shape.betas, leaves)
@@ -250,14 +211,14 @@ class Registrar:
             torch.zeros(len(rows), dtype=torch.float64),
         )
         for place, row in enumerate(rows):
-            earlier = [other for other in self._trained if other < row][-1:]
-            later = [other for other in self._trained if other > row][:1]
+            earlier = [other for other in self.trained if other < row][-1:]
+            later = [other for other in self.trained if other > row][:1]
             if not earlier or not later:
                 continue
-            pair = self._poses(earlier + later)
+            pair = self.poses(earlier + later)
             times = [self.views[earlier[0]].time, self.views[later[0]].time]
             middle = interpolate_pose(pair, times, [self.views[row].time])
-            own = self._poses([row])
+            own = self.poses([row])
             for name, columns in (("global_orient", slice(0, 3)), ("hand_pose", slice(3, 48))):
                 goal = axis_angle_to_matrix(getattr(middle, name).double().view(-1, 3))
                 here = axis_angle_to_matrix(getattr(own, name).double().view(-1, 3))
@@ -326,7 +287,7 @@ class Registrar:
         """The tracker's points, robustly: they say which finger is where when outlines cannot."""
         p = self.priors
         index = torch.tensor(rows)
-        pose = self._poses(rows)
+        pose = self.poses(rows)
         step = torch.zeros(len(rows), POSE_SIZE)
 
         def marks(step: Tensor) -> Tensor:
@@ -359,7 +320,7 @@ class Registrar:
         limited[:, 48:] = limited[:, 48:].clamp(-0.03, 0.03)
         good = torch.isfinite(limited).all(-1)
         index = torch.tensor(rows)[good]
-        self.table.put(index, turned(self._poses(index.tolist()), limited[good]))
+        self.table.put(index, turned(self.poses(index.tolist()), limited[good]))
 
     def _move_surface(self, subdivision: Subdivision, blocks: Tensor, sides: Tensor) -> None:
         """The rest surface's offsets [V,3]: all frames' evidence against smoothness."""
@@ -380,16 +341,6 @@ class Registrar:
         right = k * subdivision.gather(sides) - smooth(self.shape.displacement)
         step = conjugate_gradients(apply, right, 60)
         self.shape.displacement += step.clamp(-0.003, 0.003)
-
-
-def difference(before: HandPose, after: HandPose) -> Tensor:
-    """The step [B,51] that :func:`turned` takes from ``before`` to ``after``."""
-    columns = []
-    for name in ("global_orient", "hand_pose"):
-        goal = axis_angle_to_matrix(getattr(after, name).unflatten(-1, (-1, 3)))
-        here = axis_angle_to_matrix(getattr(before, name).unflatten(-1, (-1, 3)))
-        columns.append(matrix_to_axis_angle(goal @ here.mT).flatten(1))
-    return torch.cat([*columns, after.transl - before.transl], -1)
 
 
 def conjugate_gradients(apply: Callable[[Tensor], Tensor], right: Tensor, iterations: int) -> Tensor:

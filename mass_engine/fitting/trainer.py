@@ -25,6 +25,7 @@ from mass_engine.fitting.state import FitState, fingerprint_of
 from mass_engine.fitting.steadying import jitter, steadied
 from mass_engine.fitting.subject import Appearance, Shape
 from mass_engine.fitting.surfel_fit import SurfelFit, SurfelPass, SurfelWeights
+from mass_engine.fitting.sweep import sweep
 from mass_engine.fitting.views import View
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
@@ -178,7 +179,7 @@ class Trainer:
 
     def _sweep(self, progress: Progressed) -> None:
         skin = Skin.attached(self.bind(*REGISTERED))
-        self.registrar.sweep(SWEEP, skin.binding, lambda row: colors_of(self.scene, skin, row), progress)
+        sweep(self.registrar, SWEEP, skin.binding, lambda row: colors_of(self.scene, skin, row), progress)
 
     def _texture(self, turn: Round, progress: Progressed) -> None:
         pulls = self.state.notes.setdefault("pull_pixels", [])

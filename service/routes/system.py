@@ -39,6 +39,7 @@ class Capabilities(BaseModel):
 
     version: str
     engine: str = Field(description="The engine's version; a result's report names the one that made it.")
+    device: Literal["cpu", "cuda"] = Field(description="Where jobs that ask for no device are fitted.")
     needs_key: bool
     workers: int = Field(description="Workers alive now, as far as this process sees.")
     containers: list[str]
@@ -100,6 +101,7 @@ def get_capabilities(services: ServicesDep) -> Capabilities:
     return Capabilities(
         version=version("mass-hand"),
         engine=version("mass-hand"),
+        device="cuda" if settings.default_queue == "gpu" else "cpu",
         needs_key=asks_for_keys(settings.auth, settings.host),
         workers=len(live_workers(settings.data_dir)),
         containers=["mp4", "mov", "webm"],

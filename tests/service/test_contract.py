@@ -102,6 +102,7 @@ def test_the_page_and_the_docs_are_served_with_a_strict_policy(live: Live) -> No
 
 def test_capabilities_name_the_limits(live: Live) -> None:
     body = live.http.get("/capabilities").json()
+    assert body["device"] == "cpu"
     assert body["max_upload_bytes"] == live.services.settings.max_upload_bytes
     assert body["max_render_pixels"] == live.services.settings.max_render_pixels
     assert body["channels"] == list(get_args(Channel))

@@ -32,6 +32,7 @@ from mass_engine.preprocess import Clip
 from mass_engine.raster import RenderOutput
 from mass_engine.surfel.shading import irradiance_basis
 from mass_engine.surfel.subdivision import Subdivision, loop_subdivision
+from mass_engine.threads import one_thread
 
 BaselineName = Literal["mesh", "surfels-random", "surfels-vertices", "gaussians-3d"]
 BASELINES: tuple[BaselineName, ...] = get_args(BaselineName)
@@ -101,8 +102,9 @@ def fit_baseline(name: BaselineName, hand: Registered, seed: int, effort: float 
         "surfels-vertices": "vertices",
         "gaussians-3d": "gaussians",
     }
-    model = BoundSplats.make(kinds[name], hand.shape, hand.light, hand.camera, seed)
-    train_splats(model, hand.views, hand.trained, hand.pose, seed, effort)
+    with one_thread():  # sums over threads run in any order: the same seed would give another look
+        model = BoundSplats.make(kinds[name], hand.shape, hand.light, hand.camera, seed)
+        train_splats(model, hand.views, hand.trained, hand.pose, seed, effort)
     return model
 
 

@@ -20,8 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mass_engine.avatar import row_pose
-from mass_engine.evaluation.scores import mean_scores, score_view
+from mass_engine.evaluation.scores import heldout_means
 from mass_engine.fitting.components import Components
 from mass_engine.fitting.schedule import Schedule, schedule_for
 from mass_engine.fitting.trainer import fit_hand
@@ -70,11 +69,8 @@ def run(clip: Clip, parts: Components, seed: int, checkpoint: Path, stop: bool =
     result = fit_hand(
         clip.views, clip.start, clip.model, clip.camera, reduced(parts), seed, progress, parts, checkpoint
     )
-    pose = result.avatar.frames.pose
-    held = [row for row, view in enumerate(clip.views) if view.heldout]
-    scores = [score_view(result.avatar, clip.views[row], row_pose(pose, row)) for row in held]
     return {
-        **mean_scores(scores),
+        **heldout_means(result.avatar, clip.views),
         "surfels": result.avatar.skin.count,
         "seconds": round(time.perf_counter() - started, 1),
         "undone_steps": result.state.notes.get("undone_steps", 0),

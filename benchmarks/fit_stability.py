@@ -18,8 +18,7 @@ from typing import Any
 
 import torch
 
-from mass_engine.avatar import row_pose
-from mass_engine.evaluation.scores import mean_scores, score_view
+from mass_engine.evaluation.scores import heldout_means
 from mass_engine.fitting.schedule import schedule_for
 from mass_engine.fitting.trainer import fit_hand
 from mass_engine.options import FitOptions
@@ -38,14 +37,11 @@ def run(clip: Clip, seed: int, radians: float) -> dict[str, Any]:
     start = replace(pose, global_orient=shaken(pose.global_orient), hand_pose=shaken(pose.hand_pose))
     started = time.perf_counter()
     result = fit_hand(clip.views, start, clip.model, clip.camera, schedule_for("auto"), seed, lambda *_: None)
-    fitted = result.avatar.frames.pose
-    held = [row for row, view in enumerate(clip.views) if view.heldout]
-    scores = [score_view(result.avatar, clip.views[row], row_pose(fitted, row)) for row in held]
     finite = all(bool(torch.isfinite(value).all()) for value in vars(result.avatar.appearance).values())
     return {
         "seed": seed,
         "radians": radians,
-        **mean_scores(scores),
+        **heldout_means(result.avatar, clip.views),
         "finite": finite,
         "undone_steps": result.state.notes.get("undone_steps", 0),
         "surfels": result.avatar.skin.count,

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from mass_engine.avatar import Avatar, row_pose
 from mass_engine.camera import Camera
 from mass_engine.evaluation import metrics
 from mass_engine.evaluation.flip import flip
@@ -140,3 +141,15 @@ def mean_scores(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
         values = [value for value in given if math.isfinite(value)]
         result[name] = sum(values) / len(values) if values else None
     return result
+
+
+def heldout_means(avatar: Avatar, views: Sequence[View]) -> dict[str, float | None]:
+    """Means of :func:`score_view` over the held-out ``views``, in the order of the avatar's frames."""
+    frames = avatar.frames
+    return mean_scores(
+        [
+            score_view(avatar, view, row_pose(frames.pose, row), frames.gains[row])
+            for row, view in enumerate(views)
+            if view.heldout
+        ]
+    )

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mass_engine.fitting.poses import PoseTable
+from mass_engine.fitting.registration import overlap
 from mass_engine.fitting.skin import Skin
 from mass_engine.fitting.subject import START_OPACITY, Appearance, PosedSurfels, Shape, draw, render_row
 from mass_engine.fitting.views import View
@@ -42,6 +43,17 @@ class Scene:
         only = torch.tensor([row])
         leaves = {name: value[only] for name, value in self.table.values.items()}
         return skin.pose(self.shape, self.table.pose(self.shape.betas, leaves))
+
+    def overlaps(self, skin: Skin, appearance: Appearance, rows: Sequence[int], side: int = 160) -> Tensor:
+        """How well the silhouettes of rows overlap as they stand [B], in pictures of ``side`` pixels."""
+        covered = []
+        for row in rows:
+            level = self.views[row].level(side)
+            with torch.no_grad():
+                surfels = self.surfels(skin, row)
+                out = render_row(appearance, surfels, 0, skin.bones, level.camera, self.raster)
+            covered.append(overlap(level, out.alpha))
+        return torch.tensor(covered)
 
 
 @dataclass(frozen=True)

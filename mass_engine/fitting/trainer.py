@@ -17,6 +17,7 @@ from mass_engine.fitting.conversion import convert, deform_surfels, finish
 from mass_engine.fitting.evidence import Evidence, Scene, colors_of, fill_unseen, gather, spread
 from mass_engine.fitting.gauss_newton import Registrar, Round
 from mass_engine.fitting.geometry import GeometryFit, GeometryPass
+from mass_engine.fitting.heldout_poses import place_heldout
 from mass_engine.fitting.looks import Looks, Show
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.schedule import SWEEP, Schedule
@@ -33,7 +34,6 @@ from mass_engine.raster import RasterOptions
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import white_light
 from mass_engine.threads import one_thread
-from mass_engine.tracking.alignment import interpolate_pose
 
 #: Frames whose mean texture the others are registered against.
 REGISTRATION_FRAMES = 100
@@ -139,10 +139,12 @@ class Trainer:
         seconds = self.state.notes.setdefault("seconds", {})
         for number, (name, share, work) in enumerate(steps):
             if number >= len(self.state.steps):
-                begin, started = done / total, time.perf_counter()
+                begin, started, undone = done / total, time.perf_counter(), self.registrar.undone
                 progress(begin, name)
                 work(lambda f, b=begin, s=share, n=name: progress(b + s / total * f, n))  # type: ignore[misc]
                 seconds[name] = round(seconds.get(name, 0.0) + time.perf_counter() - started, 2)
+                taken_back = self.state.notes.get("poses_taken_back", 0) + self.registrar.undone - undone
+                self.state.notes["poses_taken_back"] = taken_back
                 self.state.steps.append(name)
                 if checkpoint is not None:
                     self.state.light, self.state.gains = self.registrar.light, self.scene.gains
@@ -179,7 +181,15 @@ class Trainer:
 
     def _sweep(self, progress: Progressed) -> None:
         skin = Skin.attached(self.bind(*REGISTERED))
-        sweep(self.registrar, SWEEP, skin.binding, lambda row: colors_of(self.scene, skin, row), progress)
+        look = Appearance.plain(skin.count, white_light())
+        sweep(
+            self.registrar,
+            SWEEP,
+            skin.binding,
+            lambda row: colors_of(self.scene, skin, row),
+            lambda rows: self.scene.overlaps(skin, look, rows),
+            progress,
+        )
 
     def _texture(self, turn: Round, progress: Progressed) -> None:
         pulls = self.state.notes.setdefault("pull_pixels", [])
@@ -247,15 +257,18 @@ class Trainer:
         self._count(fitter.undone)
 
     def _heldout(self, progress: Progressed) -> None:
-        heldout = [row for row, view in enumerate(self.views) if view.heldout]
-        if not self.schedule.heldout:
-            return  # poses are the tracker's, all of them
-        _place_heldout(self.views, self.state.table, self.start)
-        self.registrar.forget(heldout)
-        outline = self.bind(1, 0)
-        for done, turn in enumerate(self.schedule.heldout):
-            self.registrar.step(turn, outline, Appearance.plain(outline.count, self.registrar.light), heldout)
-            progress((done + 1) / len(self.schedule.heldout))
+        evidence = self.state.evidence
+        if self.schedule.heldout and evidence is not None:  # otherwise poses are the tracker's, all of them
+            # The finished hand ends at the wrist: one that a wrong pose shows from behind is open there.
+            (skin, look), _ = finish(self.state, evidence, self.scene)
+            place_heldout(
+                self.registrar,
+                self.schedule.heldout,
+                self.bind(1, 0),
+                self.start,
+                lambda rows: self.scene.overlaps(skin, look, rows, 320),
+            )
+        progress(1.0)
 
 
 def fit_hand(
@@ -312,24 +325,6 @@ def _cost(turn: Round) -> float:
 
 def _visit_cost(turn: SurfelPass) -> float:
     return turn.visits * 2 * (60.0**2 + turn.side**2)
-
-
-def _place_heldout(views: list[View], table: PoseTable, start: HandPose) -> None:
-    """Start each held-out pose between its neighbours' refined poses."""
-    trained = [row for row, view in enumerate(views) if not view.heldout]
-    heldout = [row for row, view in enumerate(views) if view.heldout]
-    rows = torch.tensor(trained)
-    known = HandPose(
-        start.betas[rows],
-        table.values["global_orient"][rows],
-        table.values["hand_pose"][rows],
-        table.values["transl"][rows],
-        start.side,
-    )
-    between = interpolate_pose(
-        known, [views[row].time for row in trained], [views[row].time for row in heldout]
-    )
-    table.put(torch.tensor(heldout), between)
 
 
 def _best_frame(views: list[View]) -> int:

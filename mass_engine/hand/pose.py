@@ -48,3 +48,9 @@ class HandPose:
     def rest(side: Side = "right") -> HandPose:
         """The flat hand at the origin with the mean shape."""
         return HandPose(torch.zeros(10), torch.zeros(3), torch.zeros(45), torch.zeros(3), side)
+
+    def rows(self, index: Tensor) -> HandPose:
+        """Some rows (``index`` [B]) of a batch of hands."""
+        return HandPose(
+            self.betas[index], self.global_orient[index], self.hand_pose[index], self.transl[index], self.side
+        )

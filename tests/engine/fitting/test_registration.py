@@ -12,8 +12,8 @@ from mass_engine.fitting.kinematics import pose_jacobian, shape_jacobian, turned
 from mass_engine.fitting.light import LightSample, solve_light
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.registration import signed_distance
+from mass_engine.fitting.starts import difference
 from mass_engine.fitting.subject import Shape, vertex_normals
-from mass_engine.fitting.sweep import difference
 from mass_engine.hand.builtin import load_builtin
 from mass_engine.hand.pose import HandPose
 from mass_engine.raster import RasterOptions

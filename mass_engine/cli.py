@@ -11,6 +11,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 
@@ -28,6 +29,17 @@ COMPONENT_SWITCHES = {
     "refine_pose": "the tracker's poses, the template's shape",
     "shading": "no light: one colour from every side",
     "harmonics": "no view-dependent colour",
+}
+
+#: ``mass-engine bench NAME``: the module whose ``run`` takes the rest of the line.
+BENCHMARKS = {
+    "raster": "bench_raster",
+    "render": "bench_render",
+    "fit": "bench_fit",
+    "pareto": "pareto",
+    "stability": "stability",
+    "needed": "needed",
+    "clips": "by_clip",
 }
 
 Command = Callable[[argparse.Namespace], None]
@@ -153,7 +165,7 @@ def build_parser() -> argparse.ArgumentParser:
     bench = commands.add_parser(
         "bench", help="measure speed on this machine, speed against accuracy, or stability"
     )
-    bench.add_argument("what", choices=("raster", "render", "fit", "pareto", "stability", "clips"))
+    bench.add_argument("what", choices=BENCHMARKS)
     bench.add_argument("rest", nargs=argparse.REMAINDER)
     bench.set_defaults(run=_bench)
     return parser
@@ -324,30 +336,7 @@ def _page(arguments: argparse.Namespace) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> None:
-    if arguments.what == "raster":
-        from mass_engine.evaluation import bench_raster
-
-        bench_raster.run(arguments.rest)
-    elif arguments.what == "fit":
-        from mass_engine.evaluation import bench_fit
-
-        bench_fit.run(arguments.rest)
-    elif arguments.what == "pareto":
-        from mass_engine.evaluation import pareto
-
-        pareto.run(arguments.rest)
-    elif arguments.what == "stability":
-        from mass_engine.evaluation import stability
-
-        stability.run(arguments.rest)
-    elif arguments.what == "clips":
-        from mass_engine.evaluation import by_clip
-
-        by_clip.run(arguments.rest)
-    else:
-        from mass_engine.evaluation import bench_render
-
-        bench_render.run(arguments.rest)
+    import_module(f"mass_engine.evaluation.{BENCHMARKS[arguments.what]}").run(arguments.rest)
 
 
 if __name__ == "__main__":

@@ -21,14 +21,14 @@ from mass_engine.avatar import SourceFrames
 from mass_engine.camera import Camera
 from mass_engine.evaluation.mesh_raster import mesh_mask, rasterize_mesh
 from mass_engine.evaluation.outlines import iou
+from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.scores import Renderable
 from mass_engine.evaluation.splats import BoundSplats, SplatKind, train_splats
 from mass_engine.fitting.schedule import Schedule
 from mass_engine.fitting.subject import Shape, mesh_edges, vertex_normals
-from mass_engine.fitting.trainer import fit_hand
+from mass_engine.fitting.trainer import REGISTERED
 from mass_engine.fitting.views import View
 from mass_engine.hand.pose import HandPose
-from mass_engine.preprocess import Clip
 from mass_engine.raster import RenderOutput
 from mass_engine.surfel.shading import irradiance_basis
 from mass_engine.surfel.subdivision import Subdivision, loop_subdivision
@@ -77,19 +77,22 @@ class Registered:
         return self.frames.pose_of(self.views[row].index)
 
 
-def register(clip: Clip, schedule: Schedule, seed: int) -> Registered:
+def register(registrations: Registrations, schedule: Schedule) -> Registered:
     """Stage one alone (and the poses of held-out frames)."""
-    start = time.perf_counter()
-    bare = replace(schedule, levels=1, depth=0, harmonics=0, detached=False, deforming=(), appearance=())
-    result = fit_hand(clip.views, clip.start, clip.model, clip.camera, bare, seed, lambda *_: None)
+    levels, depth = REGISTERED  # no settling under other surfels; and nobody asks what these ones look like
+    bare = replace(
+        schedule, levels=levels, depth=depth, harmonics=0, detached=False, deforming=(), appearance=(),
+        adaptive=False, gather_frames=4, gather_side=160,
+    )  # fmt: skip
+    result, seconds = registrations.fit(bare)
     avatar = result.avatar
     return Registered(
-        clip.views,
+        registrations.clip.views,
         avatar.shape,
         avatar.appearance.light,
-        clip.camera,
+        registrations.clip.camera,
         avatar.frames,
-        time.perf_counter() - start,
+        seconds,
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mass_engine.evaluation.bench_clips import rows_of
 from mass_engine.fitting.kinematics import turned
 from mass_engine.fitting.views import View
 from mass_engine.hand.model import mirror_pose
@@ -31,11 +32,13 @@ Masks = Callable[
 
 @dataclass(frozen=True)
 class Level:
-    """One strength of one perturbation: its place on the axis, its name, and what it does."""
+    """One strength of one perturbation: its place on the axis, its name, and what it does. The fit's own
+    seed is moved by ``reseed``."""
 
     value: float
     name: str
     change: Change
+    reseed: int = 0
 
 
 def axes() -> dict[str, list[Level]]:
@@ -56,6 +59,7 @@ def axes() -> dict[str, list[Level]]:
         "only one side seen": [Level(1, "back", _one_side(True)), Level(2, "palm", _one_side(False))],
         "field of view, factor": [Level(f, f"{f:g}", _field_of_view(f)) for f in (0.6, 0.8, 1.25, 1.6)],
         "hand side": [Level(1, "wrong", _wrong_side)],
+        "random seed": [Level(n, f"+{n}", lambda clip, _: clip, 1000 * n) for n in (1, 2, 3)],
     }
     return {name: [same, *levels] for name, levels in found.items()}
 
@@ -77,13 +81,7 @@ def _fresh(view: View, **parts: NDArray[np.generic]) -> View:
 
 def _rows(clip: Clip, wanted: list[int]) -> Clip:
     """The clip with these training rows alone, and every held-out one."""
-    keep = sorted({*wanted, *(row for row, view in enumerate(clip.views) if view.heldout)})
-    index = torch.tensor(keep)
-    pose = clip.start
-    start = HandPose(
-        pose.betas[index], pose.global_orient[index], pose.hand_pose[index], pose.transl[index], pose.side
-    )
-    return replace(clip, views=[clip.views[row] for row in keep], start=start)
+    return rows_of(clip, [*wanted, *(row for row, view in enumerate(clip.views) if view.heldout)])
 
 
 def _posed(clip: Clip, start: HandPose) -> Clip:

@@ -1,268 +1,230 @@
 """``mass-engine bench stability``: what is lost when the clip is worse than it should be, ours and baselines.
 
-Each axis makes one thing worse in steps, on the prepared clip, for several seeds; held-out pictures and masks
-stay clean, so a loss is the fit's. A run fails when it raises, gives numbers that are not finite, or loses
-more than 3 dB inside the mask against the same method on the clip as it is.
+Each axis makes one thing worse in steps, on the prepared clip; held-out pictures and masks stay clean, so a
+loss is the fit's. A run fails when it raises, gives numbers that are not finite, or loses more than 3 dB
+against the same method on the clip as it is. Ours and the baselines go on from one registration of each
+changed clip. One seed of every axis comes first, then the next; tables and charts are written after every
+condition, and --resume goes on.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
+import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mass_engine.errors import BadArgumentError, EngineError
-from mass_engine.evaluation.baselines import BASELINES, BaselineName, fit_baseline, register
-from mass_engine.evaluation.charts import Chart, Series, draw
+from mass_engine.evaluation import metrics
+from mass_engine.evaluation.baselines import BASELINES, BaselineName, Registered, fit_baseline, register
+from mass_engine.evaluation.bench_clips import clips_of
 from mass_engine.evaluation.command import tell
-from mass_engine.evaluation.heldout import REFINED
-from mass_engine.evaluation.pareto import clips_of, fit_clip
+from mass_engine.evaluation.outlines import iou
 from mass_engine.evaluation.perturb import Level, axes
-from mass_engine.evaluation.refine import RefineOptions, refine_pose
-from mass_engine.evaluation.scores import Renderable, mean_scores, score_view
+from mass_engine.evaluation.refine import refine_pose
+from mass_engine.evaluation.registrations import Registrations
+from mass_engine.evaluation.results_file import read_rows, write_results, write_text
+from mass_engine.evaluation.scores import Comparison, Renderable, Scores, mean_scores
+from mass_engine.evaluation.stability_report import OURS, UNCHANGED, Trial, charts, markdown
 from mass_engine.fitting.schedule import Schedule, schedule_for
+from mass_engine.fitting.views import View
 from mass_engine.hand.pose import HandPose
 from mass_engine.preprocess import Clip
+from mass_engine.threads import one_thread
 
-#: More than this lost is a failure, dB.
-FAILURE = 3.0
-OURS = "ours"
-
-Tell = Callable[[str], None]
+_FAILURES = (EngineError, RuntimeError, ValueError, ArithmeticError)
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One run of one method. ``psnr`` is None where there is none; ``error`` says why."""
+class Condition:
+    """One clip, one level of one axis, one seed."""
 
     clip: str
     axis: str
-    value: float
-    level: str
-    method: str
+    level: Level
     seed: int
-    psnr: float | None
-    iou: float | None
-    refined_psnr: float | None = None
-    error: str = ""
 
 
-def trials(
+@dataclass(frozen=True)
+class Effort:
+    """How every method is run: our ``schedule``, how often the ``baselines`` see every frame (1: 13 times),
+    and whether held-out poses are ``refined`` for a second figure."""
+
+    schedule: Schedule
+    baselines: float
+    refined: bool
+
+
+def conditions(
+    clips: Sequence[str], wanted: dict[str, list[Level]], seeds: Sequence[int]
+) -> Iterator[Condition]:
+    """Everything, seed by seed; the clip as it is (the first level of each axis) once a seed, first."""
+    for seed in seeds:
+        for clip in clips:
+            for number, (axis, levels) in enumerate(wanted.items()):
+                if number == 0:
+                    yield Condition(clip, UNCHANGED, levels[0], seed)
+                for level in levels[1:]:
+                    yield Condition(clip, axis, level, seed)
+
+
+def trials(clip: Clip, place: Condition, methods: Sequence[str], effort: Effort) -> Iterator[Trial]:
+    """Every method under one condition; an error of a fit is a result."""
+    level = place.level
+    clip = level.change(clip, np.random.default_rng([place.seed, *place.axis.encode()]))
+    with tempfile.TemporaryDirectory() as folder:
+        registrations = Registrations(clip, place.seed + level.reseed, Path(folder))
+        hands: list[Registered] = []
+
+        def ours() -> tuple[Renderable, dict[int, HandPose]]:
+            avatar = registrations.fit(effort.schedule)[0].avatar
+            return avatar, {view.index: avatar.frames.pose_of(view.index) for view in clip.views}
+
+        def baseline(name: BaselineName) -> tuple[Renderable, dict[int, HandPose]]:
+            if not hands:
+                hands.append(register(registrations, effort.schedule))
+            poses = {view.index: hands[0].pose(row) for row, view in enumerate(clip.views)}
+            return fit_baseline(name, hands[0], registrations.seed, effort.baselines), poses
+
+        makers: dict[str, Callable[[], tuple[Renderable, dict[int, HandPose]]]] = {
+            OURS: ours,
+            **{name: lambda name=name: baseline(name) for name in BASELINES},  # type: ignore[misc]
+        }
+        for method in methods:
+            yield _trial(clip, place, method, makers[method], effort.refined)
+
+
+def _trial(
     clip: Clip,
-    name: str,
-    wanted: dict[str, list[Level]],
-    methods: Sequence[str],
-    seeds: Sequence[int],
-    schedule: Schedule,
+    place: Condition,
+    method: str,
+    make: Callable[[], tuple[Renderable, dict[int, HandPose]]],
     refine: bool,
-    effort: float,
-    tell: Tell,
-) -> Iterator[Trial]:
-    """Every method at every level of every axis. The clip as it is is run once a seed for all axes."""
-    done: dict[int, list[Trial]] = {}
-    for axis, levels in wanted.items():
-        for level in levels:
-            for seed in seeds:
-                if level.value == 0.0 and seed in done:
-                    for trial in done[seed]:
-                        yield Trial(**{**asdict(trial), "axis": axis})
-                    continue
-                tell(f"{name}: {axis} {level.name}, seed {seed}")
-                random = np.random.default_rng([seed, *axis.encode()])
-                found = list(
-                    _run(
-                        level.change(clip, random), name, axis, level, methods, seed, schedule, refine, effort
-                    )
-                )
-                if level.value == 0.0:
-                    done[seed] = found
-                yield from found
-
-
-def _run(
-    clip: Clip,
-    name: str,
-    axis: str,
-    level: Level,
-    methods: Sequence[str],
-    seed: int,
-    schedule: Schedule,
-    refine: bool,
-    effort: float,
-) -> Iterator[Trial]:
-    def trial(method: str, make: Callable[[], tuple[Renderable, dict[int, HandPose]]]) -> Trial:
-        place = (name, axis, level.value, level.name, method, seed)
-        try:
-            psnr, iou, second = _score(*make(), clip, refine)
-        except (EngineError, RuntimeError, ValueError, ArithmeticError) as error:
-            return Trial(*place, None, None, None, f"{type(error).__name__}: {error}"[:200])
-        return Trial(*place, psnr, iou, second)
-
-    def ours() -> tuple[Renderable, dict[int, HandPose]]:
-        avatar = fit_clip(clip, schedule, seed)[0].avatar
-        return avatar, {view.index: avatar.frames.pose_of(view.index) for view in clip.views}
-
-    if OURS in methods:
-        yield trial(OURS, ours)
-    baselines = [method for method in BASELINES if method in methods]
-    if not baselines:
-        return
+) -> Trial:
+    key = (place.clip, place.axis, place.level.value, place.level.name, method, place.seed)
+    started = time.perf_counter()
     try:
-        hand = register(clip, schedule, seed)
-    except (EngineError, RuntimeError, ValueError) as error:
-        for method in baselines:
-            yield Trial(name, axis, level.value, level.name, method, seed, None, None, None, str(error)[:200])
-        return
-    poses = {view.index: hand.pose(row) for row, view in enumerate(clip.views)}
-    for method in baselines:
-
-        def made(method: BaselineName = method) -> tuple[Renderable, dict[int, HandPose]]:
-            return fit_baseline(method, hand, seed, effort), poses
-
-        yield trial(method, made)
+        found = _score(*make(), clip, refine)
+    except _FAILURES as error:
+        spent = round(time.perf_counter() - started, 1)
+        return Trial(*key, None, None, None, None, spent, f"{type(error).__name__}: {error}"[:200])
+    return Trial(*key, *found, round(time.perf_counter() - started, 1))
 
 
 def _score(
     subject: Renderable, poses: dict[int, HandPose], clip: Clip, refine: bool
-) -> tuple[float | None, float | None, float | None]:
-    """Mean PSNR in the mask and silhouette IoU, and the PSNR after test-time refinement."""
-    rows, again = [], []
-    for view in clip.views:
-        if view.heldout:
-            rows.append(score_view(subject, view, poses[view.index]))
-            if refine:
-                better = refine_pose(subject, view, poses[view.index], RefineOptions())
-                again.append(score_view(subject, view, better))
-    first, second = mean_scores(rows), mean_scores(again)
-    if any(not math.isfinite(row["psnr_in_mask"]) for row in rows):
-        raise ArithmeticError("a held-out frame has no finite score")
-    return first["psnr_in_mask"], first["silhouette_iou"], second.get("psnr_in_mask")
-
-
-def summarised(found: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Mean, worst and failure rate of every axis, level and method over clips and seeds."""
-    base = {(t.clip, t.method, t.seed): t.psnr for t in found if t.value == 0.0 and t.psnr is not None}
-    rows = []
-    for key in dict.fromkeys((t.axis, t.value, t.level, t.method) for t in found):
-        own = [t for t in found if (t.axis, t.value, t.level, t.method) == key]
-        known = [t.psnr for t in own if t.psnr is not None]
-        again = [t.refined_psnr for t in own if t.refined_psnr is not None]
-        failed = [
-            t for t in own
-            if t.psnr is None or t.psnr < base.get((t.clip, t.method, t.seed), -math.inf) - FAILURE
-        ]  # fmt: skip
-        rows.append(
-            {
-                "axis": key[0],
-                "value": key[1],
-                "level": key[2],
-                "method": key[3],
-                "runs": len(own),
-                "psnr_in_mask": sum(known) / len(known) if known else None,
-                "worst": min(known) if known else None,
-                f"psnr_in_mask_{REFINED}": sum(again) / len(again) if again else None,
-                "failure_rate": len(failed) / len(own),
-            }
-        )
-    return rows
-
-
-def markdown(found: Sequence[Trial], command: str) -> str:
-    """One table an axis: mean / worst, dB, and failures."""
-    rows = summarised(found)
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = [
-        f"`{command}`: PSNR in the mask of held-out frames, dB: mean / worst, and the share of runs that "
-        f"fail (raise, are not finite, or lose more than {FAILURE:g} dB).",
-        "",
-    ]
-    for axis in dict.fromkeys(row["axis"] for row in rows):
-        lines += [
-            f"**{axis}**",
-            "",
-            "| level | " + " | ".join(methods) + " |",
-            "|---|" + "---|" * len(methods),
+) -> tuple[float | None, float | None, float | None, float | None]:
+    """Mean PSNR in the mask, on black and silhouette IoU; the first again after test-time refinement."""
+    held = [view for view in clip.views if view.heldout]
+    with one_thread():
+        rows = [_scores(subject, view, poses[view.index]) for view in held]
+        again = [
+            _scores(subject, view, refine_pose(subject, view, poses[view.index]))
+            for view in (held if refine else [])
         ]
-        own = [row for row in rows if row["axis"] == axis]
-        for level in dict.fromkeys(row["level"] for row in own):
-            cells = []
-            for method in methods:
-                row = next((r for r in own if (r["level"], r["method"]) == (level, method)), None)
-                if row is None or row["psnr_in_mask"] is None:
-                    cells.append("failed" if row else "")
-                    continue
-                lost = f", {row['failure_rate']:.0%} fail" if row["failure_rate"] else ""
-                cells.append(f"{row['psnr_in_mask']:.2f} / {row['worst']:.2f}{lost}")
-            lines.append(f"| {level} | " + " | ".join(cells) + " |")
-        lines.append("")
-    return "\n".join(lines)
+    if not all(math.isfinite(row["psnr"]) for row in rows):
+        raise ArithmeticError("a held-out frame has no finite score")
+    first, second = mean_scores(rows), mean_scores(again)
+    return first["psnr"], first["psnr_on_black"], first["iou"], second.get("psnr")
 
 
-def charts(found: Sequence[Trial], out: Path) -> list[Path]:
-    """One figure an axis: mean PSNR of every method, and its worst as a thin second line."""
-    written: list[Path] = []
-    rows = summarised(found)
-    for number, axis in enumerate(dict.fromkeys(row["axis"] for row in rows)):
-        own = [row for row in rows if row["axis"] == axis and row["psnr_in_mask"] is not None]
-        series = []
-        for method in dict.fromkeys(row["method"] for row in own):
-            points = sorted((r for r in own if r["method"] == method), key=lambda r: float(r["value"]))
-            xs = [float(r["value"]) for r in points]
-            series.append(Series(method, xs, [r["psnr_in_mask"] for r in points]))
-            series.append(Series(f"{method}, worst", xs, [r["worst"] for r in points], marker="."))
-        if series:
-            chart = Chart(f"Stability: {axis} (0: as it is)", axis, "PSNR in the mask, dB", series)
-            name = "".join(c if c.isalnum() else "-" for c in axis).strip("-")
-            written += draw(chart, out / f"stability-{number:02d}-{name}")
-    return written
+def _scores(subject: Renderable, view: View, pose: HandPose) -> Scores:
+    found = Comparison.of(subject, view, pose)
+    render = metrics.to_8bit(found.render)
+    return {
+        "psnr": metrics.psnr(render, found.video, found.hand) if bool(found.hand.any()) else math.nan,
+        "psnr_on_black": metrics.psnr(*found.on_black(render)),
+        "iou": iou(found.alpha > 0.5, found.hand, found.valid),
+    }
 
 
 def run(rest: Sequence[str]) -> None:
     """The command."""
-    known = axes()
-    parser = argparse.ArgumentParser(prog="mass-engine bench stability", description=__doc__)
-    parser.add_argument("videos", type=Path, nargs="*", metavar="VIDEO")
-    parser.add_argument("--out", type=Path, default=Path("bench-stability"))
-    parser.add_argument("--quick", action="store_true", help="two axes, one level, only to see that it works")
-    parser.add_argument("--axis", action="append", default=[], metavar="NAME", help="part of an axis's name")
-    parser.add_argument("--method", action="append", default=[], choices=(OURS, *BASELINES))
-    parser.add_argument("--preset", default="draft", choices=("draft", "auto", "full"))
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--max-frames", type=int, default=80)
-    parser.add_argument("--refine", action="store_true", help="score after test-time refinement, too")
-    arguments = parser.parse_args(rest)
-    wanted = {
-        name: levels
-        for name, levels in known.items()
-        if not arguments.axis or any(part in name for part in arguments.axis)
-    }
-    if not wanted or arguments.seeds < 1:
-        raise BadArgumentError("bench.axis", "No such axis, or no seed.", f"Use part of: {', '.join(known)}.")
+    arguments = _parser().parse_args(rest)
+    wanted = _wanted(arguments.axis, arguments.quick)
+    if arguments.seeds < 1 or arguments.effort <= 0:
+        raise BadArgumentError("bench.invalid", "No seed, or no effort.", "Use --seeds 1 --effort 0.5, say.")
     methods = tuple(arguments.method) or (OURS, *BASELINES)
-    seeds = list(range(arguments.seeds))
-    if arguments.quick:
-        wanted = {name: [levels[0], levels[-1]] for name, levels in list(wanted.items())[:2]}
-        seeds = seeds[:1]
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     command = " ".join(["mass-engine bench stability", *rest])
-    found: list[Trial] = []
-    for name, clip in clips_of(arguments.videos, arguments.quick, 0, arguments.max_frames, out):
-        for trial in trials(
-            clip, name, wanted, methods, seeds, schedule_for(arguments.preset), arguments.refine,
-            0.3 if arguments.quick else 1.0, tell,
-        ):  # fmt: skip
-            found.append(trial)
-            data = {"command": command, "quick": arguments.quick, "trials": [asdict(t) for t in found]}
-            (out / "stability.json").write_text(json.dumps(data, indent=2) + "\n")
-    table = markdown(found, command)
-    (out / "stability.md").write_text(table)
+    names = ("quick", "preset", "max_frames", "heldout", "side", "effort", "refine")
+    settings = {name: getattr(arguments, name) for name in names}
+    file = out / "stability.json"
+    found = [Trial(**row) for row in read_rows(file, arguments.resume, settings)]
+    clips = dict(
+        clips_of(
+            arguments.videos, arguments.quick, 0, arguments.max_frames, out, arguments.heldout, arguments.side
+        )
+    )
+    preset = "draft" if arguments.quick else arguments.preset
+    effort = Effort(schedule_for(preset), arguments.effort, arguments.refine)
+    notes = _notes(arguments, preset, clips)
+    for place in conditions(list(clips), wanted, range(1 if arguments.quick else arguments.seeds)):
+        key = (place.clip, place.axis, place.level.name, place.seed)
+        done = {t.method for t in found if (t.clip, t.axis, t.level, t.seed) == key}
+        left = [method for method in methods if method not in done]
+        if not left:
+            continue
+        started = time.perf_counter()
+        found += trials(clips[place.clip], place, left, effort)
+        spent = time.perf_counter() - started
+        tell(f"{place.clip}: {place.axis}, {place.level.name}, seed {place.seed}: {spent:.0f} s")
+        write_results(file, command, settings, [asdict(trial) for trial in found])
+        write_text(out / "stability.md", markdown(found, command, notes))
+        if place.axis != UNCHANGED:
+            charts(found, out, [place.axis])
+    table = markdown(found, command, notes)
+    write_text(out / "stability.md", table)
     print(table)
     for path in charts(found, out):
         print(f"wrote {path}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="mass-engine bench stability", description=__doc__)
+    add = parser.add_argument
+    add("videos", type=Path, nargs="*", metavar="VIDEO")
+    add("--out", type=Path, default=Path("bench-stability"))
+    add("--quick", action="store_true", help="two axes, one level, only to see that it works")
+    add("--axis", action="append", default=[], metavar="NAME", help="part of an axis's name")
+    add("--method", action="append", default=[], choices=(OURS, *BASELINES))
+    add("--preset", default="auto", choices=("draft", "auto", "full"))
+    add("--seeds", type=int, default=1)
+    add("--max-frames", type=int, default=40, help="training frames")
+    add("--heldout", type=int, default=12, help="held-out frames at most")
+    add("--side", type=int, default=320, help="longer side of the crops, pixels")
+    add("--effort", type=float, default=0.5, help="of the baselines; 1: every frame 13 times")
+    add("--refine", action="store_true", help="score after test-time refinement, too")
+    add("--resume", action="store_true", help="go on with the results in --out")
+    return parser
+
+
+def _wanted(parts: Sequence[str], quick: bool) -> dict[str, list[Level]]:
+    known = axes()
+    wanted = {
+        name: levels for name, levels in known.items() if not parts or any(part in name for part in parts)
+    }
+    if not wanted:
+        raise BadArgumentError("bench.axis", "No such axis.", f"Use part of: {', '.join(known)}.")
+    if quick:
+        wanted = {name: [levels[0], levels[-1]] for name, levels in list(wanted.items())[:2]}
+    return wanted
+
+
+def _notes(arguments: argparse.Namespace, preset: str, clips: dict[str, Clip]) -> list[str]:
+    frames = ", ".join(
+        f"{name} ({sum(not v.heldout for v in clip.views)} training frames, "
+        f"{sum(v.heldout for v in clip.views)} held out)"
+        for name, clip in clips.items()
+    )
+    return [
+        f"Clips: {frames}; crops of at most {arguments.side} pixels, in which pixels of an axis are counted.",
+        f"Ours: preset {preset}. Baselines: the same registration, then {arguments.effort:g} times their "
+        "usual steps (usual: every frame 13 times).",
+    ]

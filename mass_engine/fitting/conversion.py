@@ -18,7 +18,7 @@ from mass_engine.fitting.schedule import Schedule
 from mass_engine.fitting.skin import Skin
 from mass_engine.fitting.state import FitState
 from mass_engine.fitting.subject import Appearance
-from mass_engine.fitting.surfel_fit import SurfelFit
+from mass_engine.fitting.surfel_fit import SurfelFit, rounded
 from mass_engine.surfel.binding import MeshBinding
 
 #: How far into the hand from its wrist joint it may be cut, metres at the mean size.
@@ -93,13 +93,12 @@ def deform_surfels(
 ) -> None:
     """Stage one's last part: the detached surfels leave the mesh, if the validation frames gain by it.
 
-    An adaptive schedule tries without them, then with ever more hash levels, and takes the least that gains;
-    others take the finest.
+    An adaptive schedule tries without them, then with ever more hash levels, and takes the least that gains:
+    none, where there are no validation frames to show a gain. Others take the finest.
     """
     skin, appearance = state.surfels()
-    choose = schedule.adaptive and bool(fitter.scene.validation)
-    levels = (0, *HASH_LEVELS) if choose else HASH_LEVELS[-1:]
-    tried: list[dict[str, float]] = []
+    levels = _hash_levels(schedule, fitter)
+    tried: list[dict[str, float | None]] = []
     best = (-math.inf, 0, skin, appearance)
     for number, count in enumerate(levels):
         moved, look = _candidate(state, skin, appearance, count, seed)
@@ -107,8 +106,8 @@ def deform_surfels(
         for turn, stage in enumerate(schedule.deforming):
             reached = fitter.run(moved, look, stage, seed * 1009 + 50 + turn).after
         progress((number + 1) / len(levels))
-        tried.append({"hash_levels": count, "validation": round(reached, 3)})
-        if choose and number and not reached >= best[0] + capacity.DEFORMATION_GAIN:
+        tried.append({"hash_levels": count, "validation": rounded(reached)})
+        if number and not reached >= best[0] + capacity.DEFORMATION_GAIN:
             break
         best = (reached, count, moved, look)
     _, count, state.skin, state.appearance = best
@@ -116,6 +115,13 @@ def deform_surfels(
         state.evidence = _rows(state.evidence, torch.arange(state.skin.count))
     state.notes["deformation"] = {"tried": tried, "hash_levels": count}
     state.notes["capacity"]["detached"] = len(state.skin.detached)
+
+
+def _hash_levels(schedule: Schedule, fitter: SurfelFit) -> tuple[int, ...]:
+    """What to try, in order; 0 is without detached surfels."""
+    if not schedule.adaptive:
+        return HASH_LEVELS[-1:]
+    return (0, *HASH_LEVELS) if fitter.scene.validation else (0,)
 
 
 def _candidate(

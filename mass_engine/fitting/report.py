@@ -97,12 +97,14 @@ class HandsReport:
 def curves(notes: dict[str, Any]) -> dict[str, list[float]]:
     """What fell and rose during a fit, by name, from the fit's own notes (``FitState.notes``)."""
     pulls: list[dict[str, float]] = notes.get("pull_pixels", [])
-    passes: list[dict[str, float]] = notes.get("stage_two", [])
-    reached = [value for turn in passes for value in (turn["validation_before"], turn["validation_after"])]
+    passes: list[dict[str, float | None]] = notes.get("stage_two", [])
+    reached = [turn[f"validation_{when}"] for turn in passes for when in ("before", "after")]
     found = {
         "pull of the training frames, pixels": [turn["training"] for turn in pulls],
         "pull of the validation frames, pixels": [turn["validation"] for turn in pulls],
-        "validation PSNR before and after each pass of stage two, dB": [v for v in reached if v == v],
+        "validation PSNR before and after each pass of stage two, dB": [
+            value for value in reached if value is not None
+        ],
     }
     return {name: values for name, values in found.items() if values}
 

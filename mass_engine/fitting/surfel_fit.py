@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -69,14 +70,19 @@ class PassResult:
     before: float
     after: float
 
-    def summary(self, side: int) -> dict[str, float]:
-        """For the report."""
+    def summary(self, side: int) -> dict[str, float | None]:
+        """For the report; None where nothing was validated (JSON has no NaN)."""
         return {
             "side": side,
             "visits": self.visits,
-            "validation_before": round(self.before, 3),
-            "validation_after": round(self.after, 3),
+            "validation_before": rounded(self.before),
+            "validation_after": rounded(self.after),
         }
+
+
+def rounded(decibels: float) -> float | None:
+    """To three digits, None for NaN."""
+    return round(decibels, 3) if math.isfinite(decibels) else None
 
 
 class SurfelFit:

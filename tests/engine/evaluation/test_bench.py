@@ -8,11 +8,17 @@ from pathlib import Path
 import pytest
 
 from mass_engine.cli import main
-from mass_engine.evaluation import pareto, stability
+from mass_engine.errors import BadArgumentError
+from mass_engine.evaluation import needed, pareto, stability_report
 from mass_engine.evaluation.charts import draw_bars
 from mass_engine.evaluation.heldout import REFINED
-from mass_engine.evaluation.pareto import Point, front, variants
-from mass_engine.evaluation.stability import Trial, summarised
+from mass_engine.evaluation.needed import Size, sizes
+from mass_engine.evaluation.pareto import Point, front
+from mass_engine.evaluation.perturb import axes
+from mass_engine.evaluation.results_file import read_rows, write_results
+from mass_engine.evaluation.stability import conditions
+from mass_engine.evaluation.stability_report import UNCHANGED, Trial, summarised
+from mass_engine.evaluation.variants import variants
 
 
 def test_the_front_is_what_nothing_beats() -> None:
@@ -26,8 +32,8 @@ def test_the_grid_changes_one_thing_at_a_time() -> None:
     grid = variants(quick=False)
     assert set(grid["preset"]) == {"draft", "auto", "full"}
     base = grid["preset"]["auto"]
-    assert {count.harmonics for count in grid["harmonics"].values()} == {0, 3, 8, 15}
-    for schedule in grid["harmonics"].values():
+    assert [one.harmonics for one in grid["harmonics, every surfel"].values()] == [0, 3, 8, 15]
+    for schedule in grid["harmonics, every surfel"].values():
         assert (schedule.levels, schedule.appearance) == (base.levels, base.appearance)
     assert max(step.side for step in grid["resolution"]["160 px"].appearance) == 160
     assert len(variants(quick=True)["preset"]) == 1
@@ -35,7 +41,7 @@ def test_the_grid_changes_one_thing_at_a_time() -> None:
 
 def point(name: str, group: str, seconds: float, psnr: float, clip: str = "a", error: str = "") -> Point:
     metrics: dict[str, float | None] = {"psnr_in_mask": psnr, "ms_ssim_hand_on_black": 0.9}
-    return Point(clip, group, name, seconds, 50.0, 1000, 10, metrics, {}, error)
+    return Point(clip, group, name, seconds, 50.0, 1000, 10, metrics, {}, {}, error)
 
 
 def test_pareto_tables_and_charts(tmp_path: Path) -> None:
@@ -57,26 +63,81 @@ def test_pareto_tables_and_charts(tmp_path: Path) -> None:
     assert written[0].read_bytes() == first  # equal figures are equal files
 
 
+def trial(level: str, seed: int, psnr: float | None, value: float = 1.0, on_black: float = 30.0) -> Trial:
+    axis = UNCHANGED if level == UNCHANGED else "blur, px"
+    black = None if psnr is None else on_black
+    return Trial(
+        "a", axis, value, level, "ours", seed, psnr, black, 0.9, error="" if psnr else "RuntimeError: no"
+    )
+
+
 def test_stability_counts_failures(tmp_path: Path) -> None:
     found = [
-        Trial("a", "blur, px", 0.0, "as it is", "ours", 0, 28.0, 0.9),
-        Trial("a", "blur, px", 0.0, "as it is", "ours", 1, 27.0, 0.9),
-        Trial("a", "blur, px", 2.0, "2", "ours", 0, 26.0, 0.9, 29.0),
-        Trial("a", "blur, px", 2.0, "2", "ours", 1, 23.0, 0.9, 27.0),
-        Trial("a", "blur, px", 4.0, "4", "ours", 0, None, None, None, "RuntimeError: no"),
+        trial(UNCHANGED, 0, 28.0, 0.0),
+        trial(UNCHANGED, 1, 27.0, 0.0),
+        trial("2", 0, 26.0, 2.0),
+        trial("2", 1, 23.0, 2.0),
+        trial("3", 0, 28.0, 3.0, on_black=26.5),  # nothing lost in the mask, but around it
+        trial("4", 0, None, 4.0),
     ]
     rows = {row["level"]: row for row in summarised(found)}
-    assert rows["as it is"]["failure_rate"] == 0
-    assert rows["2"]["psnr_in_mask"] == 24.5
-    assert rows["2"]["worst"] == 23.0
+    assert rows[UNCHANGED]["failure_rate"] == 0
+    assert rows["2"]["psnr"] == 24.5
+    assert rows["2"]["psnr_worst"] == 23.0
     assert rows["2"]["failure_rate"] == 0.5
-    assert rows["2"]["psnr_in_mask_after_test_time_pose_refinement"] == 28.0
-    assert rows["4"]["psnr_in_mask"] is None
+    assert rows["3"]["failure_rate"] == 1.0
+    assert rows["4"]["psnr"] is None
     assert rows["4"]["failure_rate"] == 1.0
-    table = stability.markdown(found, "the command")
-    assert "| 2 | 24.50 / 23.00, 50% fail |" in table
-    assert "| 4 | failed |" in table
-    assert len(stability.charts(found, tmp_path)) == 2
+    table = stability_report.markdown(found, "the command", ["what was run"])
+    assert "| 2 | 2 | 24.50 (23.00) / 30.00, 50% fail |" in table
+    assert "| 4 | 1 | failed |" in table
+    assert "- what was run" in table
+    assert len(stability_report.charts(found, tmp_path)) == 2
+    assert len(stability_report.charts(found[:2], tmp_path)) == 2  # only the clip as it is: still a figure
+
+
+def test_one_seed_of_every_axis_comes_before_the_next() -> None:
+    wanted = axes()
+    plan = list(conditions(["a", "b"], wanted, range(2)))
+    assert [place.seed for place in plan] == sorted(place.seed for place in plan)
+    unchanged = [place for place in plan if place.axis == UNCHANGED]
+    assert [(place.seed, place.clip) for place in unchanged] == [(0, "a"), (0, "b"), (1, "a"), (1, "b")]
+    one = [place for place in plan if (place.seed, place.clip) == (0, "b")]
+    assert one[0].axis == UNCHANGED
+    assert list(dict.fromkeys(place.axis for place in one[1:])) == list(wanted)
+    assert len({(place.axis, place.level.name) for place in one}) == len(one)
+    seeds = {place.level.reseed for place in one if place.axis == "random seed"}
+    assert len(seeds) == 3
+    assert 0 not in seeds
+
+
+def test_results_are_taken_up_again_with_the_same_settings_only(tmp_path: Path) -> None:
+    file = tmp_path / "x.json"
+    assert read_rows(file, True, {"side": 320}) == []
+    write_results(file, "the command", {"side": 320}, [{"a": 1}])
+    assert read_rows(file, True, {"side": 320}) == [{"a": 1}]
+    assert read_rows(file, False, {"side": 320}) == []
+    with pytest.raises(BadArgumentError, match="other side"):
+        read_rows(file, True, {"side": 640})
+    file.write_text("{}")
+    with pytest.raises(BadArgumentError) as caught:
+        read_rows(file, True, {"side": 320})
+    assert caught.value.code == "bench.resume"
+
+
+def test_the_needed_model(tmp_path: Path) -> None:
+    grid = sizes(3, quick=False)
+    assert len(grid) >= 6
+    assert all(one.harmonics == 3 and not one.detached and not one.deforming for one in grid.values())
+    found = [
+        Size("a", "L1 D1", 39_000, 60.0, 9.0, 0.02, 29.0, 30.0),
+        Size("a", "L0 D0", 2_400, 50.0, 14.0, None, 25.0, 26.0),
+        Size("a", "auto", 20_000, 70.0, 9.1, 0.021, 29.0, 30.0, auto=True),
+    ]
+    table = needed.markdown(found, "the command")
+    assert table.index("| L0 D0 | 2,400 |") < table.index("| **auto** (stopped here) | 20,000 |")
+    assert "| L1 D1 | 39,000 | 60.0 | 9.00 | 0.0200 | 29.00 | 30.00 |" in table
+    assert [path.name for path in needed.charts(found, tmp_path)] == ["needed.svg", "needed.png"]
 
 
 def test_bars_and_wrong_axes(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ def test_curves_come_from_the_notes_and_leave_out_what_is_not_there() -> None:
             {"side": 320, "training": 2.0, "validation": 2.5},
             {"side": 640, "training": 1.0, "validation": 1.5},
         ],
-        "stage_two": [{"validation_before": float("nan"), "validation_after": float("nan")}],
+        "stage_two": [{"validation_before": None, "validation_after": None}],
     }
     found = curves(notes)
     assert list(found.values()) == [[2.0, 1.0], [2.5, 1.5]]

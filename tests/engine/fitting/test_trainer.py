@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -179,6 +180,15 @@ def test_every_part_can_be_switched_off(parts: Components) -> None:
     assert bool((avatar.frames.gains != 1).any()) == parts.exposure
     assert torch.equal(avatar.appearance.light, white_light()) == (not parts.shading)
     assert (avatar.appearance.sh.shape[1] > 0) == parts.harmonics
+
+
+def test_without_validation_frames_nothing_leaves_the_mesh() -> None:
+    result = fitted(make_views(true_poses(9), HELDOUT))
+    notes = result.state.notes
+    assert notes["deformation"] == {"tried": [{"hash_levels": 0, "validation": None}], "hash_levels": 0}
+    assert notes["capacity"]["detached"] == len(result.avatar.skin.detached) == 0
+    assert result.avatar.skin.deformation is None
+    json.dumps(notes, allow_nan=False)
 
 
 def test_an_avatar_with_detached_surfels_survives_its_file(tmp_path: Path) -> None:

@@ -43,6 +43,8 @@ from mass_engine.tracking.offsets import tracked_points
 
 #: Frames whose Jacobians are held at a time.
 CHUNK = 12
+#: Step of the differences that the landmarks' derivatives are, radians and metres.
+DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -287,20 +289,15 @@ class Registrar:
         """The tracker's points, robustly: they say which finger is where when outlines cannot."""
         p = self.priors
         index = torch.tensor(rows)
-        pose = self.poses(rows)
-        step = torch.zeros(len(rows), POSE_SIZE)
-
-        def marks(step: Tensor) -> Tensor:
-            joints, turns = self.shape.model.skeleton(turned(pose, step))
-            return tracked_points(joints, turns, self.shape.model.side, self._at_joints[index])
-
+        # Every row as it stands and moved by each of its numbers, all of them at once.
+        steps = torch.cat([torch.zeros(1, POSE_SIZE), DIFFERENCE * torch.eye(POSE_SIZE)])
+        each = torch.arange(len(rows)).repeat(len(steps))
         with torch.no_grad():
-            here = self.camera.project(marks(step))
-            columns = []
-            for number in range(POSE_SIZE):
-                moved = step.clone()
-                moved[:, number] = 1e-3
-                columns.append((self.camera.project(marks(moved)) - here) / 1e-3)
+            moved = turned(self.poses(rows).rows(each), steps.repeat_interleave(len(rows), 0))
+            joints, turns = self.shape.model.skeleton(moved)
+            marks = tracked_points(joints, turns, self.shape.model.side, self._at_joints[index][each])
+            here, *there = self.camera.project(marks).unflatten(0, (len(steps), len(rows)))
+        columns = [(place - here) / DIFFERENCE for place in there]
         jacobian = (torch.stack(columns, -1) / self._sizes[index].view(-1, 1, 1, 1)).double()
         apart = ((self._points[index] - here) / self._sizes[index].view(-1, 1, 1)).double()
         length = apart.norm(dim=-1).clamp_min(1e-9)

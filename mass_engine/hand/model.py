@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -170,7 +171,7 @@ def _local_rotations(pose: HandPose) -> Tensor:
     """[...,16,3,3]: the wrist's, then the 15 joints', each in its parent's frame."""
     wrist, fingers = pose.global_orient, pose.hand_pose
     if wrist.shape[:-1] != fingers.shape[:-1]:
-        lead: tuple[int, ...] = torch.broadcast_shapes(wrist.shape[:-1], fingers.shape[:-1])
+        lead: tuple[int, ...] = np.broadcast_shapes(wrist.shape[:-1], fingers.shape[:-1])
         wrist, fingers = wrist.expand(*lead, 3), fingers.expand(*lead, 45)
     vectors = torch.cat((wrist, fingers), -1)
     return axis_angle_to_matrix(vectors.reshape(*vectors.shape[:-1], 16, 3))
@@ -178,7 +179,7 @@ def _local_rotations(pose: HandPose) -> Tensor:
 
 def _chain(rotations: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
     """Absolute rotations [...,16,3,3] and joint places [...,16,3]; all five fingers a level at a time."""
-    lead: tuple[int, ...] = torch.broadcast_shapes(rotations.shape[:-3], rest.shape[:-2])
+    lead: tuple[int, ...] = np.broadcast_shapes(rotations.shape[:-3], rest.shape[:-2])
     turn = rotations[..., :1, :, :].expand(*lead, 1, 3, 3)
     place = rest[..., :1, :].expand(*lead, 1, 3)
     turns, places = [turn], [place]

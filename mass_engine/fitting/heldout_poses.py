@@ -16,9 +16,11 @@ from mass_engine.surfel.binding import MeshBinding
 from mass_engine.tracking.alignment import interpolate_pose
 
 #: So far below the training frames' usual overlap, another start is tried.
-BELOW = 0.1
+BELOW = 0.03
 #: What an outline may lose against the neighbours' interpolated pose: the surface stands over it on purpose.
 SLACK = 0.025
+#: What a later start must overlap more to be taken for an earlier one.
+MARGIN = 0.01
 #: Training frames that say what is usual.
 USUAL = 40
 
@@ -44,7 +46,7 @@ def place_heldout(
     correction = difference(start.rows(torch.tensor(near)), fit.poses(near))
     corrected = turned(start.rows(torch.tensor(heldout)), correction)
     starts = (between, corrected, fit.poses(near), fit.poses(far))
-    best_of(fit, heldout, between, starts, stages, binding, look, measure, SLACK, usual - BELOW)
+    best_of(fit, heldout, between, starts, stages, binding, look, measure, SLACK, usual - BELOW, MARGIN)
 
 
 def _neighbours(row: int, trained: list[int], fit: Registrar) -> tuple[int, int]:

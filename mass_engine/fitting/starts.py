@@ -28,16 +28,18 @@ def best_of(
     measure: Measure,
     slack: float,
     floor: float = 0.0,
+    margin: float = 0.0,
     motion: bool = True,
 ) -> None:
     """Give every row [B] the first of ``starts`` (each [B]) whose steps lose at most ``slack`` of the
-    silhouette of ``kept`` [B] and overlap by ``floor`` at least; or the best of all, ``kept`` among them.
+    silhouette of ``kept`` [B] and overlap by ``floor`` at least.
 
-    ``measure`` says how well the silhouettes of rows overlap as they stand.
+    Where none does, an earlier one goes before a later one that overlaps by less than ``margin`` more, and
+    ``kept`` before all that lose too much. ``measure`` says how well the silhouettes of rows overlap as they
+    stand.
     """
     fit.table.put(torch.tensor(rows), kept)
-    best, found = measure(rows), fit.poses(rows)
-    least = (best - slack).clamp_min(floor)
+    best, found = measure(rows) - slack - margin, fit.poses(rows)
     open_ = torch.arange(len(rows))
     for start in starts:
         part = [rows[place] for place in open_.tolist()]
@@ -46,12 +48,11 @@ def best_of(
         for stage in stages:
             fit.step(stage, binding, look, part, motion=motion)
         covered, reached = measure(part), fit.poses(part)
-        settled = covered >= least[open_]
-        better = settled | (covered > best[open_])
+        better = covered >= best[open_] + margin
         best[open_[better]] = covered[better]
         for name in ("global_orient", "hand_pose", "transl"):
             getattr(found, name)[open_[better]] = getattr(reached, name)[better]
-        open_ = open_[~settled]
+        open_ = open_[~better | (covered < floor)]
         if not len(open_):
             return
     last = [rows[place] for place in open_.tolist()]

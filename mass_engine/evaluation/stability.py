@@ -3,8 +3,8 @@
 Each axis makes one thing worse in steps, on the prepared clip; held-out pictures and masks stay clean, so a
 loss is the fit's. A run fails when it raises, gives numbers that are not finite, or loses more than 3 dB
 against the same method on the clip as it is. Ours and the baselines go on from one registration of each
-changed clip. One seed of every axis comes first, then the next; tables and charts are written after every
-condition, and --resume goes on.
+changed clip. One seed of every axis comes first, then the next, and the worst level of every axis before
+the others; tables and charts are written after every condition, and --resume goes on.
 """
 
 from __future__ import annotations
@@ -63,14 +63,15 @@ class Effort:
 def conditions(
     clips: Sequence[str], wanted: dict[str, list[Level]], seeds: Sequence[int]
 ) -> Iterator[Condition]:
-    """Everything, seed by seed; the clip as it is (the first level of each axis) once a seed, first."""
+    """Everything, seed by seed; the clip as it is (the first level of each axis) once a seed, first; then the
+    last level of every axis, then the one before it, so that a run cut short has all axes."""
     for seed in seeds:
         for clip in clips:
-            for number, (axis, levels) in enumerate(wanted.items()):
-                if number == 0:
-                    yield Condition(clip, UNCHANGED, levels[0], seed)
-                for level in levels[1:]:
-                    yield Condition(clip, axis, level, seed)
+            yield Condition(clip, UNCHANGED, next(iter(wanted.values()))[0], seed)
+            for back in range(1, max(map(len, wanted.values()))):
+                for axis, levels in wanted.items():
+                    if back < len(levels):
+                        yield Condition(clip, axis, levels[-back], seed)
 
 
 def trials(clip: Clip, place: Condition, methods: Sequence[str], effort: Effort) -> Iterator[Trial]:

@@ -45,7 +45,14 @@ def summarised(found: Sequence[Trial]) -> list[dict[str, Any]]:
     rows = []
     for axis in axes_of(found):
         own_axis = [t for t in found if t.axis in (UNCHANGED, axis)]
-        for key in dict.fromkeys((t.value, t.level, t.method) for t in own_axis):
+        keys = [
+            dict.fromkeys((t.value, t.level, t.method) for t in own_axis if t.axis == name)
+            for name in dict.fromkeys((UNCHANGED, axis))
+        ]
+        for key in [
+            *keys[0],
+            *(key for part in keys[1:] for key in reversed(part)),
+        ]:  # worst levels ran first
             own = [t for t in own_axis if (t.value, t.level, t.method) == key]
             failed = [t for t in own if _failed(t, base.get((t.clip, t.method, t.seed)))]
             rows.append(

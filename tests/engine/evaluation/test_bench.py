@@ -104,7 +104,9 @@ def test_one_seed_of_every_axis_comes_before_the_next() -> None:
     assert [(place.seed, place.clip) for place in unchanged] == [(0, "a"), (0, "b"), (1, "a"), (1, "b")]
     one = [place for place in plan if (place.seed, place.clip) == (0, "b")]
     assert one[0].axis == UNCHANGED
-    assert list(dict.fromkeys(place.axis for place in one[1:])) == list(wanted)
+    assert [place.axis for place in one[1 : len(wanted) + 1]] == list(wanted)
+    assert [place.level for place in one[1 : len(wanted) + 1]] == [levels[-1] for levels in wanted.values()]
+    assert sum(len(levels) - 1 for levels in wanted.values()) == len(one) - 1
     assert len({(place.axis, place.level.name) for place in one}) == len(one)
     seeds = {place.level.reseed for place in one if place.axis == "random seed"}
     assert len(seeds) == 3

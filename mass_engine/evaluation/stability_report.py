@@ -93,7 +93,7 @@ def markdown(found: Sequence[Trial], command: str, notes: Sequence[str]) -> str:
     rows = summarised(found)
     methods = list(dict.fromkeys(row["method"] for row in rows))
     lines = [
-        f"`{command}`: held-out frames: PSNR in the mask, mean (worst of the runs) / PSNR of the hand on "
+        f"`{command}`: held-out frames: PSNR in the mask, mean (worst of several runs) / PSNR of the hand on "
         "black, mean, in dB; then the share of runs that fail (raise, are not finite, or lose more than "
         f"{FAILURE:g} dB of either).",
         "",
@@ -127,7 +127,8 @@ def _cell(row: dict[str, Any] | None) -> str:
     if row["psnr"] is None or row["psnr_on_black"] is None:
         return "failed"
     lost = f", {row['failure_rate']:.0%} fail" if row["failure_rate"] else ""
-    return f"{row['psnr']:.2f} ({row['psnr_worst']:.2f}) / {row['psnr_on_black']:.2f}{lost}"
+    worst = f" ({row['psnr_worst']:.2f})" if row["runs"] > 1 else ""
+    return f"{row['psnr']:.2f}{worst} / {row['psnr_on_black']:.2f}{lost}"
 
 
 def charts(found: Sequence[Trial], out: Path, wanted: Sequence[str] = ()) -> list[Path]:

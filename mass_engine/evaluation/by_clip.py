@@ -67,5 +67,5 @@ def run(rest: Sequence[str]) -> None:
         json.dumps({"metric": arguments.metric, "clips": values}, indent=2) + "\n"
     )
     print("\n".join(lines))
-    for path in draw_bars(f"Best {arguments.metric}", arguments.metric, values, out / "clips"):
+    for path in draw_bars(f"Best {arguments.metric} of each clip", arguments.metric, values, out / "clips"):
         print(f"wrote {path}")

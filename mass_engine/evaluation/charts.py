@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from mass_engine.errors import EngineError
 
 #: Colours that are told apart also by the colour-blind (Okabe and Ito 2008).
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00", "#8A8A8A", "#000000")
+#: Places along each piece of a line that labels keep away from.
+_SAMPLES = 40
 #: Where a label may stand, in units of its distance from the point: right, left, above, below, corners.
 _AROUND = ((1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7))
 
@@ -53,7 +56,8 @@ def draw(charts: Chart | Sequence[Chart], path: Path) -> list[Path]:
     Raises EngineError ``charts.missing`` without matplotlib.
     """
     parts = [charts] if isinstance(charts, Chart) else list(charts)
-    figure = _canvas(5.6 * len(parts) + 2.2)
+    lines = sum(1 + len(one.key) for one in parts[0].series if one.name and not one.faint)
+    figure = _canvas(5.6 * len(parts) + 2.2, max(4.8, 0.5 + 0.165 * lines))
     panels = figure.subplots(1, len(parts), squeeze=False)[0]
     for axes, chart in zip(panels, parts, strict=True):
         for one in chart.series:
@@ -105,7 +109,7 @@ def _plot(axes: Any, one: Series) -> None:
         color=one.color,
         markersize=15 if one.emphasis else 3 if one.faint else 6,
         linewidth=0.9 if one.faint else 1.5,
-        markeredgecolor="white" if one.emphasis or not one.line else one.color,
+        markeredgecolor="white" if one.emphasis or not (one.line or one.marker == "x") else one.color,
         markeredgewidth=0.8,
         alpha=0.6 if one.faint else 1.0,
         zorder=4 if one.emphasis else 2 if one.faint else 3,
@@ -152,15 +156,23 @@ def _short(value: float) -> str:
 
 
 def _place_labels(axes: Any, series: Sequence[Series]) -> None:
-    """Labels beside their points, on no other label and, if there is room, on no other point."""
+    """Labels beside their points: on no other label, point or line, if there is room."""
     scale = axes.figure.dpi / 72
     marked = [one for one in series if one.marker and not one.faint]
     places = {
         id(one): axes.transData.transform(list(zip(one.x, one.y, strict=True))) for one in marked if one.x
     }
+    lines = [
+        axes.transData.transform(list(zip(one.x, one.y, strict=True))) for one in series if one.line and one.x
+    ]
     taken = [
         (x - 4 * scale, y - 4 * scale, x + 4 * scale, y + 4 * scale) for p in places.values() for x, y in p
     ]
+    for line in lines:
+        for start, end in pairwise(line):
+            for share in range(_SAMPLES + 1):
+                x, y = (start + (end - start) * share / _SAMPLES).tolist()
+                taken.append((x - scale, y - scale, x + scale, y + scale))
     high = 7.5 * scale
     for one in marked:
         for (x, y), text in zip(places.get(id(one), ()), one.labels, strict=False):
@@ -193,7 +205,7 @@ def _overlap(one: _Box, two: _Box) -> float:
     return max(wide, 0.0) * max(high, 0.0)
 
 
-def _canvas(width: float) -> Any:
+def _canvas(width: float, height: float = 4.8) -> Any:
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -203,7 +215,7 @@ def _canvas(width: float) -> Any:
             "Charts need matplotlib, which is not installed.",
             "Install the extra: pip install 'mass-hand[charts]'.",
         ) from error
-    figure = Figure(figsize=(width, 4.8), dpi=130, layout="constrained")
+    figure = Figure(figsize=(width, height), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
@@ -213,6 +225,7 @@ def _name(axes: Any, title: str, x_label: str, y_label: str) -> None:
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.grid(alpha=0.3)
+    axes.set_axisbelow(True)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
 

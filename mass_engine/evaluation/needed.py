@@ -143,18 +143,22 @@ def markdown(found: Sequence[Size], command: str) -> str:
 def charts(found: Sequence[Size], out: Path) -> list[Path]:
     """Both errors against surfels, a line a clip; ``auto`` is a star of the clip's colour."""
     panels = []
+    names = list(dict.fromkeys(size.name for size in found if not size.auto))
+    names.sort(key=lambda name: min(size.surfels for size in found if size.name == name))
+    key = [f"{place + 1}  {name}" for place, name in enumerate(names)]
     for column, label in ERRORS:
-        series = []
+        series = [Series("levels and depth", [], [], line=False, marker="", key=key)]
         for place, clip in enumerate(dict.fromkeys(size.clip for size in found)):
             own = [one for one in found if one.clip == clip and getattr(one, column) is not None]
             line = sorted((one for one in own if not one.auto), key=lambda one: one.surfels)
             color = PALETTE[place % len(PALETTE)]
             xs, ys = [one.surfels for one in line], [getattr(one, column) for one in line]
-            series.append(Series(clip, xs, ys, [one.name for one in line], color=color))
+            labels = [str(names.index(one.name) + 1) for one in line]
+            series.append(Series(clip, xs, ys, labels, color=color))
             star = [one for one in own if one.auto]
             series.append(
                 Series(
-                    f"where {DEFAULT} stopped", [one.surfels for one in star],
+                    f"{clip}: where {DEFAULT} stopped", [one.surfels for one in star],
                     [getattr(one, column) for one in star], line=False, marker="*", color=color,
                     emphasis=True,
                 )

@@ -231,7 +231,8 @@ def charts(points: Sequence[Point], out: Path) -> list[Path]:
     """Three metrics against each cost; the front is a line, the default preset a star."""
     written: list[Path] = []
     rows = averaged(points)
-    groups = list(dict.fromkeys(str(row["group"]) for row in rows))
+    groups = [*variants(quick=False), "baseline"]  # each its colour, whatever is missing
+    clips = ", ".join(dict.fromkeys(point.clip for point in points))
     for metric in METRICS[:3]:
         for cost, label in COSTS:
             known = [row for row in rows if row.get(metric) is not None and row[cost] > 0]
@@ -245,9 +246,17 @@ def charts(points: Sequence[Point], out: Path) -> list[Path]:
                     color="#BBBBBB",
                 )
             ]  # fmt: skip
+            ours = [row for row in known if (row["group"], row["name"]) == ("preset", DEFAULT)]
+            if ours:
+                star = [ours[0][cost]], [ours[0][metric]]
+                series.append(
+                    Series("our default", *star, line=False, marker="*", color="#C00000", emphasis=True)
+                )
             numbers = {(row["group"], row["name"]): str(place + 1) for place, row in enumerate(rows)}
             for place, group in enumerate(groups):
                 own = [row for row in known if row["group"] == group]
+                if not own:
+                    continue
                 labels = [numbers[row["group"], row["name"]] for row in own]
                 series.append(
                     Series(
@@ -256,13 +265,7 @@ def charts(points: Sequence[Point], out: Path) -> list[Path]:
                         key=[f"{n}  {row['name']}" for n, row in zip(labels, own, strict=True)],
                     )
                 )  # fmt: skip
-            ours = [row for row in known if (row["group"], row["name"]) == ("preset", DEFAULT)]
-            if ours:
-                star = [ours[0][cost]], [ours[0][metric]]
-                series.append(
-                    Series("our default", *star, line=False, marker="*", color="#C00000", emphasis=True)
-                )
-            title = f"Held-out frames, mean over {len({point.clip for point in points})} clip(s)"
+            title = f"Held-out frames of {clips}"
             chart = Chart(title, label, LABELS[metric], series, log_x=True)
             written += draw(chart, out / f"pareto-{metric}-{cost}")
     return written

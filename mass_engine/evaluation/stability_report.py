@@ -100,7 +100,7 @@ def markdown(found: Sequence[Trial], command: str, notes: Sequence[str]) -> str:
     rows = summarised(found)
     methods = list(dict.fromkeys(row["method"] for row in rows))
     lines = [
-        f"`{command}`: held-out frames: PSNR in the mask, mean (worst of the runs) / PSNR of the hand on "
+        f"`{command}`: held-out frames: PSNR in the mask, mean (worst of several runs) / PSNR of the hand on "
         "black, mean, in dB; then the share of runs that fail (raise, are not finite, or lose more than "
         f"{FAILURE:g} dB of either).",
         "",
@@ -134,12 +134,13 @@ def _cell(row: dict[str, Any] | None) -> str:
     if row["psnr"] is None or row["psnr_on_black"] is None:
         return "failed"
     lost = f", {row['failure_rate']:.0%} fail" if row["failure_rate"] else ""
-    return f"{row['psnr']:.2f} ({row['psnr_worst']:.2f}) / {row['psnr_on_black']:.2f}{lost}"
+    worst = f" ({row['psnr_worst']:.2f})" if row["runs"] > 1 else ""
+    return f"{row['psnr']:.2f}{worst} / {row['psnr_on_black']:.2f}{lost}"
 
 
 def charts(found: Sequence[Trial], out: Path, wanted: Sequence[str] = ()) -> list[Path]:
     """One figure an axis (``wanted``: only these): both PSNR of every method, its worst run as a thin second
-    line; levels at which nothing came out have no point."""
+    line; a cross where a run fails, at the bottom and with a gap in the line where none came out."""
     written: list[Path] = []
     rows = summarised(found)
     for axis in dict.fromkeys(row["axis"] for row in rows):
@@ -159,12 +160,27 @@ def charts(found: Sequence[Trial], out: Path, wanted: Sequence[str] = ()) -> lis
 def _series(rows: Sequence[dict[str, Any]], levels: Sequence[str], column: str) -> list[Series]:
     order = (OURS, *BASELINES)
     series = []
+    lowest = min((row[column] for row in rows if row[column] is not None), default=0.0)
+    crosses: list[tuple[float, float]] = []
     for method in [name for name in order if any(row["method"] == name for row in rows)]:
-        points = [row for row in rows if row["method"] == method and row[column] is not None]
-        places = [float(levels.index(row["level"])) for row in points]
+        points = {row["level"]: row for row in rows if row["method"] == method}
+        places = [float(place) for place, level in enumerate(levels) if level in points]
+        own = [points[level] for level in levels if level in points]
         color = PALETTE[order.index(method)]
-        series.append(Series(method, places, [row[column] for row in points], color=color))
-        if any(row["runs"] > 1 for row in points):
-            worst = [row[f"{column}_worst"] for row in points]
+        series.append(Series(method, places, [_plotted(row[column]) for row in own], color=color))
+        if any(row["runs"] > 1 for row in own):
+            worst = [_plotted(row[f"{column}_worst"]) for row in own]
             series.append(Series(f"{method}, worst", places, worst, color=color, faint=True))
+        for place, row in zip(places, own, strict=True):
+            if row["failure_rate"]:
+                crosses.append((place, lowest if row[column] is None else row[column]))
+    if crosses:
+        xs, ys = [x for x, _ in crosses], [y for _, y in crosses]
+        failing = Series("a run fails", xs, ys, line=False, marker="x", color="#000000")
+        series.append(failing)
     return series
+
+
+def _plotted(value: float | None) -> float:
+    """A gap in the line where there is no value."""
+    return math.nan if value is None else value

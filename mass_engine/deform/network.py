@@ -128,10 +128,6 @@ class Deformation(nn.Module):
         """Residuals [B,N] for ``hand_pose`` [B,45] and ``betas`` [B,10]; differentiable."""
         return self._decoder(self.grid() @ self.first_hash).residuals(hand_pose, betas)
 
-    def place(self, centroids: Tensor, faces: Tensor) -> None:
-        """Deform other surfels from now on with the same weights (a finer binding of the same hand, say)."""
-        self.grid.place(self.cube.coordinates(centroids), faces)
-
     def freeze(self) -> FrozenDeformation:
         """For inference: the hash grid's share of the first layer becomes one constant row a surfel."""
         with torch.no_grad():

@@ -72,13 +72,12 @@ class Skin:
         )
 
     def pick(self, kept: Tensor, model: HandModel) -> Skin:
-        """Only the surfels ``kept`` (bool [M])."""
+        """Only the surfels ``kept`` (bool [M]); this skin stays as it is."""
         attached = int(kept[: self.detached_from].sum())
-        picked = Skin(self.binding, self.sources[kept], attached, self.deformation)
-        if picked.deformation is not None:
-            with torch.no_grad():
-                centroids = self.binding.surfels(model.template).means[picked.detached]
-            picked.deformation.place(centroids, self.binding.surfel_faces[picked.detached])
+        picked = Skin(self.binding, self.sources[kept], attached)
+        if self.deformation is not None:
+            picked.deformation = picked.new_deformation(model, self.deformation.config, 0)
+            picked.deformation.load_tensors(self.deformation.tensors())
         return picked
 
     def pose(self, shape: Shape, pose: HandPose) -> PosedSurfels:

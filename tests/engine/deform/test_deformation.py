@@ -200,7 +200,7 @@ def test_frozen_it_gives_the_same_and_a_subset_its_part() -> None:
     frozen = module.freeze().residuals(hand_pose, betas)
     surfels, faces, *_ = rest_surfels()
     rows = torch.arange(5, 900, 7)
-    module.place(surfels.means[rows], faces[rows])
+    module.grid.place(module.cube.coordinates(surfels.means[rows]), faces[rows])
     part = module(hand_pose, betas)
     for name in ("offset", "log_scale", "rotation", "mask_logit"):
         assert not getattr(frozen, name).requires_grad

@@ -107,3 +107,15 @@ def test_gains_find_the_exposure_of_every_frame_but_the_heldout() -> None:
     known = [row for row in range(8) if row != 4]
     torch.testing.assert_close(found[known], true[known] - true[known].mean(), atol=0.05, rtol=0)
     assert abs(float(found[4] - (found[3] + found[5]) / 2)) < 1e-5, "between its neighbours"
+
+
+def test_a_pick_of_detached_surfels_leaves_the_skin_as_it_is() -> None:
+    scene = thick_scene()
+    skin, _ = started(scene)
+    skin.deformation = skin.new_deformation(scene.shape.model, DeformationConfig(), 0)
+    before = scene.surfels(skin, 0).attached.means
+    kept = torch.ones(skin.count, dtype=torch.bool)
+    kept[::3] = False
+    picked = skin.pick(kept, scene.shape.model)
+    assert torch.equal(scene.surfels(skin, 0).attached.means, before)
+    assert torch.equal(scene.surfels(picked, 0).attached.means, before[:, kept])

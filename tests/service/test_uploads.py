@@ -206,7 +206,7 @@ def test_a_broken_connection_leaves_nothing(live: Live, monkeypatch: pytest.Monk
 
 def test_a_client_that_goes_silent_is_given_up(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     before = live.files()
-    monkeypatch.setattr("service.uploads._STALL_SECONDS", 0.2)
+    monkeypatch.setattr("service.receiving.STALL_SECONDS", 0.2)
     with socket.create_connection((live.host, live.port), timeout=20) as connection:
         connection.sendall(request_head(live, 900_000))
         connection.sendall(form(("video", VIDEO), end=False))

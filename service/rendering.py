@@ -260,9 +260,9 @@ def encode(image: NDArray[np.uint8], format_name: str) -> bytes:
     import numpy as np
 
     if format_name == "jpeg":
-        alpha = image[..., 3:].astype(np.float32) / 255.0
-        flat = image[..., :3] * alpha + 255.0 * (1.0 - alpha)
-        pixels = cv2.cvtColor(np.rint(flat).astype(np.uint8), cv2.COLOR_RGB2BGR)
+        alpha = cv2.cvtColor(np.ascontiguousarray(image[..., 3]), cv2.COLOR_GRAY2BGR)
+        hand = cv2.multiply(cv2.cvtColor(image, cv2.COLOR_RGBA2BGR), alpha, scale=1.0 / 255.0)
+        pixels = cv2.add(hand, cv2.bitwise_not(alpha))
         options = [cv2.IMWRITE_JPEG_QUALITY, 92]
     else:
         pixels = cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA)

@@ -118,7 +118,7 @@ async function look(job) { // the hand as it is now; there is none before it is 
 async function picture() {
   const camera = `orbit:${$("yaw").value},0`;
   const query = new URLSearchParams({
-    pose, camera, width: 512, height: 512, format: "webp", channel: $("channel").value,
+    pose, camera, width: 512, height: 512, format: "png", channel: $("channel").value,
   });
   if (!$("hands").hidden) query.set("hand", $("hand").value);
   $("picture").classList.add("busy");

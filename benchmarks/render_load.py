@@ -99,7 +99,7 @@ def _load(port: int, job_id: str, clients: int, requests: int, options: argparse
         poses = rng.uniform(-0.3, 0.3, (max(requests // clients, 1), 48))
         paths = [_path(job_id, pose.tolist(), options) for pose in poses]
         # Small and quick: what a client costs is not what is measured here.
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120.0)
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=600.0)
         barrier.wait()
         for path in paths:
             start = time.perf_counter()
@@ -136,7 +136,9 @@ def _path(job_id: str, pose: list[float], options: argparse.Namespace) -> str:
 def _service(data_dir: Path) -> Iterator[tuple[psutil.Process, int]]:
     """``mass api`` on a free port."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("MASS_")}
-    environment = {**kept, "MASS_DATA_DIR": str(data_dir), "MASS_MIN_FREE_BYTES": "0"}
+    # On a busy machine the figures say so, rather than that pictures were given up.
+    patience = {"MASS_RENDER_LOAD_TIMEOUT": "600", "MASS_RENDER_TIMEOUT": "60"}
+    environment = {**kept, **patience, "MASS_DATA_DIR": str(data_dir), "MASS_MIN_FREE_BYTES": "0"}
     log = data_dir / "api.log"
     with socket.create_server(("127.0.0.1", 0), backlog=64) as listener, log.open("wb") as output:
         port: int = listener.getsockname()[1]

@@ -23,7 +23,7 @@ from mass_engine.deform.posing import CompiledSurfels, MeshPose, PosableSurfels,
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.fitting.skin import Skin
 from mass_engine.fitting.subject import Appearance, PosedSurfels, Shape, surfel_colors
-from mass_engine.hand.model import HandModel
+from mass_engine.hand.model import HandModel, PosedHand
 from mass_engine.hand.pose import HandPose, Side
 from mass_engine.hand.poses import POSE_NAMES, parse_pose
 from mass_engine.raster import RasterOptions, RenderOutput, rasterize
@@ -62,6 +62,12 @@ class SourceFrames:
         return row_pose(self.pose, int(rows[0]))
 
 
+def _sphere(vertices: Tensor) -> tuple[Tensor, float]:
+    """Centre [3] and radius of a sphere around ``vertices`` [V,3]."""
+    center = (vertices.amax(0) + vertices.amin(0)) / 2
+    return center, float((vertices - center).norm(dim=-1).max())
+
+
 def row_pose(pose: HandPose, row: int) -> HandPose:
     """One row of a batched pose, as a batch of one."""
     only = slice(row, row + 1)
@@ -94,13 +100,20 @@ class Avatar:
     ) -> RenderOutput:
         """Rasterise one pose (a batch of one) over black."""
         options = options or RasterOptions(cull_backfaces=True)
-        return _rasterize(self._shaded(pose, camera), camera, options)
+        return _rasterize(self._shaded(pose, self._hand(pose), camera), camera, options)
 
     def image(self, pose: HandPose, camera: Camera, channel: Channel = "rgb") -> ChannelImage:
         """One channel of one pose (a batch of one)."""
-        surfels = self._shaded(pose, camera)
+        return self._image(pose, self._hand(pose), camera, channel)
+
+    def _image(self, pose: HandPose, hand: PosedHand, camera: Camera, channel: Channel) -> ChannelImage:
+        surfels = self._shaded(pose, hand, camera)
         out = _rasterize(surfels, camera, raster_options(channel, surfels.means, camera))
         return extract(channel, out, surfels.means, camera)
+
+    def _hand(self, pose: HandPose) -> PosedHand:
+        with torch.no_grad(), one_thread():
+            return self.shape.model.posed(pose, self.shape.displacement)
 
     @cached_property
     def _compiled(self) -> CompiledSurfels:
@@ -116,10 +129,9 @@ class Avatar:
             skin.detached_from,
         ).compiled()
 
-    def _shaded(self, pose: HandPose, camera: Camera) -> ShadedSurfels:
-        """The surfels in one pose (a batch of one) as ``camera`` sees them."""
+    def _shaded(self, pose: HandPose, hand: PosedHand, camera: Camera) -> ShadedSurfels:
+        """The surfels in one pose (a batch of one, and the ``hand`` in it) as ``camera`` sees them."""
         with torch.no_grad(), one_thread():
-            hand = self.shape.model.posed(pose, self.shape.displacement)
             refined = self.skin.binding.subdivision.apply(hand.vertices)[0]
             center = -camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3]
             bones = hand.bone_transforms[0, :, :3, :3]
@@ -131,12 +143,17 @@ class Avatar:
         A named pose takes the orientation of the frame that shows the hand best; what is not a frame
         stands on the camera's axis at that frame's distance.
         """
+        return self._placed(spec)[0]
+
+    def _placed(self, spec: str) -> tuple[HandPose, PosedHand]:
+        """The pose of :meth:`resolve_pose`, and the hand in it: posed once, wherever it is then put."""
         text = spec.strip()
         if text.startswith("frame:"):
             number = text.removeprefix("frame:")
             if not (number.isascii() and number.isdigit() and len(number) < 10):
                 raise BadArgumentError("pose.invalid", f"{spec[:40]!r} names no frame.", "Use frame:12, say.")
-            return self.frames.pose_of(int(number))
+            pose = self.frames.pose_of(int(number))
+            return pose, self._hand(pose)
         best = self.frames.pose_of(self.best_frame)
         parsed = parse_pose(text, self.shape.model.side, self.shape.model)
         orient = best.global_orient if text in POSE_NAMES else parsed.global_orient.reshape(1, 3)
@@ -147,21 +164,16 @@ class Avatar:
             torch.zeros(1, 3),
             parsed.side,
         )
-        center, _ = self._bounds(pose)
-        target = self.camera_point(float(best.transl[0, 2]))
-        return HandPose(pose.betas, pose.global_orient, pose.hand_pose, (target - center)[None], pose.side)
+        hand = self._hand(pose)
+        center, _ = _sphere(hand.vertices[0])
+        shift = (self.camera_point(float(best.transl[0, 2])) - center)[None]
+        placed = HandPose(pose.betas, pose.global_orient, pose.hand_pose, shift, pose.side)
+        return placed, hand.moved(shift)
 
     def camera_point(self, depth: float) -> Tensor:
         """The world point [3] on the fitted camera's axis at ``depth`` metres."""
         rotation, shift = self.camera.world_to_camera[:3, :3], self.camera.world_to_camera[:3, 3]
         return rotation.T @ (torch.tensor([0.0, 0.0, max(depth, 0.1)]) - shift)
-
-    def _bounds(self, pose: HandPose) -> tuple[Tensor, float]:
-        """Centre [3] and radius of a sphere around the posed hand."""
-        with torch.no_grad():
-            vertices = self.shape.model.posed(pose, self.shape.displacement).vertices[0]
-        center = (vertices.amax(0) + vertices.amin(0)) / 2
-        return center, float((vertices - center).norm(dim=-1).max())
 
     def view(
         self,
@@ -175,9 +187,10 @@ class Avatar:
         if not (1 <= width <= 16384 and 1 <= height <= 16384):
             raise BadArgumentError("size.invalid", f"{width}x{height} is not a picture.", "Use 1 to 16384.")
         wanted = parse_channel(channel)
-        pose = self.resolve_pose(pose_spec)
-        center, radius = self._bounds(pose)
-        return self.image(pose, parse_camera(camera_spec, self.camera, width, height, center, radius), wanted)
+        pose, hand = self._placed(pose_spec)
+        center, radius = _sphere(hand.vertices[0])
+        camera = parse_camera(camera_spec, self.camera, width, height, center, radius)
+        return self._image(pose, hand, camera, wanted)
 
     def render(
         self,
@@ -188,7 +201,8 @@ class Avatar:
         channel: str = "rgb",
     ) -> NDArray[np.uint8]:
         """The picture of :meth:`view`: straight-alpha RGBA uint8 [H,W,4]."""
-        return self.view(pose_spec, camera_spec, width, height, channel).picture()
+        with one_thread():
+            return self.view(pose_spec, camera_spec, width, height, channel).picture()
 
     def cloud(self, pose_spec: str = "rest") -> SurfelCloud:
         """The surfels in a pose, shaded as in the clip; hand at the origin for poses that are no frame.

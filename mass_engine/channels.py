@@ -71,7 +71,7 @@ class ChannelImage:
         alpha = self.alpha.clamp(0, 1)
         match self.channel:
             case "rgb":
-                color = self.values / alpha.clamp_min(1e-4).unsqueeze(-1)
+                color = self.values
             case "alpha":
                 color, alpha = alpha.unsqueeze(-1).expand(-1, -1, 3), torch.ones_like(alpha)
             case "depth":
@@ -84,9 +84,15 @@ class ChannelImage:
                 color = _distortion_colors(self.values, alpha)
             case "surfels":
                 color, alpha = _surfel_map(self.values, alpha)
-        color = torch.where(alpha.unsqueeze(-1) > 1e-4, color, 0.0)
-        rgba = torch.cat([color.clamp(0, 1), alpha.unsqueeze(-1)], -1)
-        return cast("NDArray[np.uint8]", (rgba * 255).round().to(torch.uint8).numpy())
+        # Most of a picture is empty: only the rest of it is worked on.
+        seen = (alpha > 1e-4).flatten().nonzero().squeeze(1)
+        cover = alpha.reshape(-1, 1)[seen]
+        shown = color.reshape(-1, 3)[seen]
+        if self.channel == "rgb":
+            shown = shown / cover
+        picture = torch.zeros(alpha.numel(), 4, dtype=torch.uint8)
+        picture[seen] = (torch.cat([shown.clamp(0, 1), cover], -1) * 255).round().to(torch.uint8)
+        return cast("NDArray[np.uint8]", picture.view(*alpha.shape, 4).numpy())
 
 
 def raster_options(channel: Channel, means: Tensor, camera: Camera) -> RasterOptions:

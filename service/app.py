@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager
 from importlib.metadata import version
 from typing import Any
 
@@ -17,10 +17,12 @@ from fastapi.staticfiles import StaticFiles
 from service import problems
 from service.access.gate import Gate, asks_for_keys, is_public
 from service.access.keys import KeyStore
+from service.access.rates import RateLimiter
 from service.bodies import BodyLimit
 from service.guard import Guard
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
 from service.jobs.schemas import UploadedJob
+from service.metrics import own_port
 from service.observing import Observer
 from service.problems import Kind, ProblemBody, declared
 from service.rendering import Loader, load_avatar
@@ -33,6 +35,8 @@ from service.webhooks.sender import Sender
 _WEBHOOK_GRACE = 3.0
 #: What every route but the public ones may answer.
 ACCESS = (Kind.ACCESS_KEY, Kind.ACCESS_SCOPE, Kind.ACCESS_LINK)
+#: What every route may answer: asked too often, or the database is away.
+ANYWHERE = (Kind.RATE, Kind.NOT_READY)
 
 
 def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
@@ -48,7 +52,11 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
             await run_in_threadpool(
                 sweep_uploads, services.store, services.storage, settings.orphan_upload_seconds
             )
-            with _webhooks(services):
+            with ExitStack() as stack:
+                stack.enter_context(_webhooks(services))
+                if settings.metrics_port is not None:
+                    figures = own_port(services.metrics, settings.metrics_host, settings.metrics_port)
+                    app.state.metrics_port = stack.enter_context(figures)
                 yield
 
     app = FastAPI(
@@ -78,7 +86,12 @@ def create_app(settings: Settings, loader: Loader = load_avatar) -> FastAPI:
     app.include_router(page.router)
     app.mount("/web", StaticFiles(directory=page.WEB), name="web")
     app.add_middleware(BodyLimit)
-    app.add_middleware(Gate, keyed=asks_for_keys(settings.auth, settings.host))
+    app.add_middleware(
+        Gate,
+        keyed=asks_for_keys(settings.auth, settings.host),
+        addresses=_limiter(settings, settings.rate_address),
+        owners=_limiter(settings, settings.rate_owner),
+    )
     app.add_middleware(Guard, hosts=frozenset({settings.host, *settings.allowed_hosts}))
     app.add_middleware(Observer)
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
@@ -99,15 +112,23 @@ def _webhooks(services: Services) -> Iterator[None]:
         thread.join(_WEBHOOK_GRACE)
 
 
+def _limiter(settings: Settings, rate: float) -> RateLimiter:
+    return RateLimiter(rate, rate * settings.rate_burst_seconds)
+
+
 def _operation_id(route: APIRoute) -> str:
     return route.name
 
 
-def _add_answer(answers: dict[str, Any], status: str, answer: dict[str, Any]) -> None:
-    if status in answers:
-        said = (answers[status]["description"], answer["description"])
-        answer = {**answer, "description": "; ".join(said)}
-    answers[status] = answer
+def _add_answers(operation: dict[str, Any], *kinds: Kind) -> None:
+    """Declare errors beside those that the route itself declares."""
+    for kind in kinds:
+        ((status, answer),) = declared(kind).items()
+        known = operation["responses"].setdefault(str(status), answer)
+        examples = known["content"][problems.MEDIA_TYPE]["examples"]
+        if kind.code not in examples:
+            known["description"] = "; ".join((known["description"], answer["description"]))
+            examples.update(answer["content"][problems.MEDIA_TYPE]["examples"])
 
 
 def _document(app: FastAPI) -> dict[str, Any]:
@@ -126,13 +147,15 @@ def _document(app: FastAPI) -> dict[str, Any]:
                     declares |= {str(s): a for s, a in bodies.items() if str(s) not in declares}
         scheme = {"type": "http", "scheme": "bearer", "description": "A key of `mass keys create`."}
         document["components"]["securitySchemes"] = {"key": scheme}
-        for path, operation in (
-            (path, item) for path, items in document["paths"].items() for item in items.values()
+        for path, method, operation in (
+            (path, *item) for path, items in document["paths"].items() for item in items.items()
         ):
             if not is_public(path):
                 operation["security"] = [{"key": []}, {}]
-                for status, answer in declared(*ACCESS).items():
-                    _add_answer(operation["responses"], str(status), answer)
+                _add_answers(operation, *ACCESS)
+            _add_answers(operation, *ANYWHERE)
+            if method not in ("get", "head", "options"):
+                _add_answers(operation, Kind.STORAGE_FULL)
             # Added by the framework wherever there is a parameter; ours are declared by the routes.
             if "application/json" in operation["responses"].get("422", {}).get("content", {}):
                 del operation["responses"]["422"]

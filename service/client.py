@@ -9,7 +9,6 @@ import os
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
@@ -17,6 +16,7 @@ from urllib.parse import quote
 
 import httpx
 
+from service.answers import FINAL, AssetInfo, EventInfo, JobError, JobInfo, parse_events, parse_job, refusal
 from service.errors import ServiceError
 from service.transfers import BytesProgress, begin, give_up, send
 
@@ -25,54 +25,8 @@ __all__ = ["AssetInfo", "BytesProgress", "EventInfo", "JobError", "JobInfo", "Ma
 DEFAULT_URL = "http://127.0.0.1:8000"
 #: How often a connection is tried again before it counts as lost.
 _RECONNECTS = 5
-FINAL = frozenset({"succeeded", "failed", "cancelled", "expired"})
-
-
-@dataclass(frozen=True)
-class JobError:
-    """Why a job failed."""
-
-    code: str
-    message: str
-    advice: str
-
-
-@dataclass(frozen=True)
-class JobInfo:
-    """A job as the service described it; ``fraction`` from 0 to 1, ``time_left`` in seconds or unknown."""
-
-    id: str
-    state: str
-    stage: str | None
-    fraction: float
-    time_left: float | None
-    message: str
-    attempt: int
-    error: JobError | None
-    created_at: str
-
-    @property
-    def finished(self) -> bool:
-        """Whether the state is final."""
-        return self.state in FINAL
-
-
-@dataclass(frozen=True)
-class AssetInfo:
-    """A file of a finished job."""
-
-    name: str
-    bytes: int
-    sha256: str
-
-
-@dataclass(frozen=True)
-class EventInfo:
-    """One event of a job; ``id`` counts from 1 without gaps."""
-
-    id: int
-    kind: str
-    data: dict[str, Any]
+#: How many times a service that was asked too often is left alone as long as it says, and how long at most.
+_WAITS, _LONGEST_WAIT = 3, 60
 
 
 class MassClient:
@@ -119,7 +73,7 @@ class MassClient:
             if resumable:
                 return self._submit_in_parts(file, size, options, on_progress)
             stream: Any = file if on_progress is None else _Counted(file, size, on_progress)
-            return _job(
+            return parse_job(
                 self._request(
                     "POST",
                     "/jobs",
@@ -152,14 +106,14 @@ class MassClient:
         """A new job of the same video."""
         wish = {"options": dict(options or {}), "from_stage": from_stage}
         headers = {"Idempotency-Key": str(uuid.uuid4())}
-        return _job(self._insist("POST", f"{_path(job_id)}/restart", json=wish, headers=headers).json())
+        return parse_job(self._insist("POST", f"{_path(job_id)}/restart", json=wish, headers=headers).json())
 
     def animate(self, job_id: str, motion: Mapping[str, Any], hand: str | None = None) -> JobInfo:
         """A job that renders a motion of a finished hand; its file is ``motion.mp4`` or ``motion.webp``."""
         headers = {"Idempotency-Key": str(uuid.uuid4())}
         query = {} if hand is None else {"hand": hand}
         path = f"{_path(job_id)}/renders"
-        return _job(self._insist("POST", path, json=dict(motion), headers=headers, params=query).json())
+        return parse_job(self._insist("POST", path, json=dict(motion), headers=headers, params=query).json())
 
     def events(self, job_id: str, after: int = 0) -> Iterator[EventInfo]:
         """What happens to the job, from the event after ``after`` to its end. Connections that break are
@@ -173,10 +127,10 @@ class MassClient:
                 ) as answer:
                     if answer.is_error:
                         answer.read()
-                        raise _refusal(answer)
+                        raise refusal(answer)
                     if answer.status_code == 204:
                         return
-                    for event in _parse_events(answer.iter_lines()):
+                    for event in parse_events(answer.iter_lines()):
                         after = event.id
                         ended = event.data.get("state") in FINAL
                         yield event
@@ -188,14 +142,14 @@ class MassClient:
 
     def job(self, job_id: str) -> JobInfo:
         """The job as it is now."""
-        return _job(self._request("GET", _path(job_id)).json())
+        return parse_job(self._request("GET", _path(job_id)).json())
 
     def jobs(self) -> Iterator[JobInfo]:
         """All jobs, newest first."""
         cursor: str | None = None
         while True:
             page = self._request("GET", "/jobs", params={} if cursor is None else {"cursor": cursor}).json()
-            yield from map(_job, page["jobs"])
+            yield from map(parse_job, page["jobs"])
             cursor = page["next"]
             if cursor is None:
                 return
@@ -209,7 +163,7 @@ class MassClient:
     ) -> JobInfo:
         """Follow the job to its end. A service that goes away is waited for, ``patience`` seconds long."""
         response = self._request("GET", _path(job_id))
-        etag, job = response.headers.get("etag", ""), _job(response.json())
+        etag, job = response.headers.get("etag", ""), parse_job(response.json())
         if on_update is not None:
             on_update(job)
         last_answer = time.monotonic()
@@ -227,7 +181,7 @@ class MassClient:
             last_answer = time.monotonic()
             if response.status_code == 304:
                 continue
-            etag, job = response.headers.get("etag", ""), _job(response.json())
+            etag, job = response.headers.get("etag", ""), parse_job(response.json())
             if on_update is not None:
                 on_update(job)
         return job
@@ -246,7 +200,7 @@ class MassClient:
 
     def cancel(self, job_id: str) -> JobInfo:
         """Stop a queued or running job."""
-        return _job(self._request("POST", f"{_path(job_id)}/cancel").json())
+        return parse_job(self._request("POST", f"{_path(job_id)}/cancel").json())
 
     def delete(self, job_id: str) -> None:
         """Remove the job and everything of it."""
@@ -298,7 +252,7 @@ class MassClient:
             ):
                 if response.is_error:
                     response.read()
-                    raise _refusal(response)
+                    raise refusal(response)
                 for chunk in response.iter_bytes():
                     file.write(chunk)
                     digest.update(chunk)
@@ -328,13 +282,21 @@ class MassClient:
         raise AssertionError("unreachable")
 
     def _request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
-        try:
-            response = self._http.request(method, path, **arguments)
-        except httpx.HTTPError as error:
-            raise self._unreachable(error) from error
-        if response.is_error:
-            raise _refusal(response)
-        return response
+        for left in range(_WAITS, -1, -1):
+            try:
+                response = self._http.request(method, path, **arguments)
+            except httpx.HTTPError as error:
+                raise self._unreachable(error) from error
+            if not response.is_error:
+                return response
+            problem = refusal(response)
+            wait = response.headers.get("retry-after", "")
+            # The answer to HEAD has no code. A form that was read once cannot be sent again.
+            too_often = problem.code in ("rate.exceeded", "http.429") and "files" not in arguments
+            if not (left and too_often and wait.isdecimal() and int(wait) <= _LONGEST_WAIT):
+                raise problem
+            time.sleep(int(wait))
+        raise AssertionError("unreachable")
 
     def _unreachable(self, error: httpx.HTTPError) -> ServiceError:
         return ServiceError(
@@ -343,19 +305,6 @@ class MassClient:
             f"The service at {self._http.base_url} does not answer ({error or type(error).__name__}).",
             "Start it with `mass serve`, or name another with --url.",
         )
-
-
-def _parse_events(lines: Iterator[str]) -> Iterator[EventInfo]:
-    """Server-sent events, as far as this service uses the format."""
-    fields: dict[str, str] = {}
-    for line in lines:
-        name, _, value = line.partition(":")
-        if line:
-            fields[name] = value.removeprefix(" ")
-            continue
-        if "data" in fields and fields.get("id", "").isdecimal():
-            yield EventInfo(int(fields["id"]), fields.get("event", "message"), json.loads(fields["data"]))
-        fields = {}
 
 
 class _Counted:
@@ -376,35 +325,3 @@ class _Counted:
 
 def _path(job_id: str) -> str:
     return f"/jobs/{quote(job_id, safe='')}"
-
-
-def _refusal(response: httpx.Response) -> ServiceError:
-    try:
-        body = response.json()
-    except ValueError:
-        body = {}
-    if not isinstance(body, dict):
-        body = {}
-    message = body.get("detail") or body.get("title") or f"The service answered {response.status_code}."
-    faults = [f"{error.get('field')}: {error.get('message')}" for error in body.get("errors") or []]
-    return ServiceError(
-        response.status_code,
-        body.get("code", f"http.{response.status_code}"),
-        "; ".join([message, *faults]),
-        body.get("advice", ""),
-    )
-
-
-def _job(body: Mapping[str, Any]) -> JobInfo:
-    error = body.get("error")
-    return JobInfo(
-        id=body["id"],
-        state=body["state"],
-        stage=body["stage"],
-        fraction=body["fraction"],
-        time_left=body["time_left"],
-        message=body["message"],
-        attempt=body["attempt"],
-        error=None if error is None else JobError(error["code"], error["message"], error["advice"]),
-        created_at=body["created_at"],
-    )

@@ -6,6 +6,7 @@ import ipaddress
 import logging
 from urllib.parse import urlsplit
 
+from sqlalchemy.exc import OperationalError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -31,6 +32,16 @@ _HEADERS = {
     # What a job is, and whose, is nobody's to keep on the way.
     "cache-control": "no-store",
 }
+
+
+def _problem_of(error: Exception) -> ProblemError:
+    """What went wrong, for its user: a bug, or a database that cannot be written or reached."""
+    if not isinstance(error, OperationalError):
+        return ProblemError(Kind.INTERNAL)
+    if "disk is full" in str(error.orig):
+        return ProblemError(Kind.STORAGE_FULL, headers={"Retry-After": "60"})
+    trouble = {"field": "database", "message": "It does not answer now."}
+    return ProblemError(Kind.NOT_READY, errors=[trouble], headers={"Retry-After": "5"})
 
 
 class Guard:
@@ -74,10 +85,10 @@ class Guard:
                 if started:
                     raise
                 log.error("%s %s failed", scope["method"], scope["path"], exc_info=error)
-                kind = Kind.INTERNAL
-        problem = ProblemError(kind)
-        has_body = "content-length" in headers or "transfer-encoding" in headers
-        problem.unread = has_body and kind is not Kind.INTERNAL
+                problem = _problem_of(error)
+        else:
+            problem = ProblemError(kind)
+            problem.unread = "content-length" in headers or "transfer-encoding" in headers
         await ProblemResponse(Request(scope), problem)(scope, receive, protected)
 
     def _refusal(self, method: str, headers: Headers) -> Kind | None:

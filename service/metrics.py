@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 
-from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from service.jobs.figures import Figures, read_figures
 from service.jobs.store import JobStore
+
+log = logging.getLogger(__name__)
 
 _RENDER_BUCKETS = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.6, 1.2, 2.5, 5.0, 10.0)
 
@@ -35,6 +39,26 @@ class Metrics:
     def text(self) -> bytes:
         """The exposition."""
         return generate_latest(self.registry)
+
+
+@contextmanager
+def own_port(metrics: Metrics, host: str, port: int) -> Iterator[int]:
+    """Serve the figures, and nothing else, on ``port`` (0: a free one; yields which) until the block ends.
+
+    Raises OSError when the port cannot be had.
+    """
+    try:
+        server, thread = start_http_server(port, host, metrics.registry)
+    except OSError as error:
+        log.error("no figures: port %d on %s cannot be had (%s)", port, host, error.strerror)
+        raise
+    log.info("figures on %s port %d", host, server.server_port)
+    try:
+        yield server.server_port
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
 
 
 class _JobCollector(Collector):

@@ -6,6 +6,7 @@ command line takes cameras in other forms), and two spellings of the same reques
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 import re
@@ -51,7 +52,7 @@ class View:
 
     def etag(self, job_id: str, artifact: str) -> str:
         """A weak tag: it names the request and the code that answers it, not the bytes."""
-        text = "|".join((job_id, artifact, version("mass-hand"), *map(str, vars(self).values())))
+        text = "|".join((job_id, artifact, _version(), *map(str, vars(self).values())))
         return f'W/"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
 
 
@@ -68,6 +69,11 @@ def canonical_view(
     if width * height > max_pixels:
         raise ProblemError(Kind.RENDER_TOO_LARGE, f"{width} x {height} is more than {max_pixels} pixels.")
     return View(_pose(pose.strip().lower()), _camera(camera.strip().lower()), width, height, picture, channel)
+
+
+@functools.cache
+def _version() -> str:
+    return version("mass-hand")  # reads a file
 
 
 def _pose(text: str) -> str:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from service.pictures import View
 from service.problems import Kind, ProblemError
 from service.settings import Settings
+from service.waiting import Line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -84,7 +85,10 @@ def warm_engine() -> None:
 
 
 class RenderPool:
-    """Makes pictures in ``workers`` processes; at most ``queue`` requests wait for one of them."""
+    """Makes pictures in ``workers`` processes; at most ``queue`` requests wait for one of them.
+
+    First come, first served among the requests of one owner; owners take turns (service/waiting.py).
+    """
 
     def __init__(
         self,
@@ -98,25 +102,25 @@ class RenderPool:
     ) -> None:
         self._loader = loader
         self._workers = workers
-        self._queue = queue
         self._timeout = timeout
         self._load_timeout = load_timeout
         self._warm = warm
-        self._waiting = 0
+        #: Nobody is in the line while a process is idle.
+        self._line: Line[_Child] = Line(queue)
         self._idle: list[_Child] = []
         self._busy: set[_Child] = set()
         self._closed = False
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
 
     def start(self) -> None:
         """Start the processes; returns before they are ready."""
-        with self._changed:
+        with self._lock:
             while len(self._idle) + len(self._busy) < self._workers:
                 self._idle.append(_Child(self._loader, self._warm))
 
-    def render(self, avatar: Path, view: View) -> bytes:
+    def render(self, avatar: Path, view: View, owner: str = "") -> bytes:
         """One encoded picture. Blocks. Raises ProblemError: busy, too slow, refused or failed."""
-        child = self._acquire(avatar)
+        child = self._acquire(avatar, owner)
         answer: tuple[Any, ...] | None = None
         try:
             limit = self._timeout if child.keeps(avatar) else self._load_timeout
@@ -137,43 +141,55 @@ class RenderPool:
 
     def close(self) -> None:
         """End the processes; a picture in the making is lost."""
-        with self._changed:
+        with self._lock:
             self._closed = True
             children = [*self._idle, *self._busy]
             self._idle.clear()
-            self._changed.notify_all()
+            self._line.clear()
         for child in children:
             child.stop(1.0)
 
     def pids(self) -> list[int]:
         """Process ids of the pool, for monitoring."""
-        with self._changed:
+        with self._lock:
             return [child.pid for child in (*self._idle, *self._busy)]
 
-    def _acquire(self, avatar: Path) -> _Child:
-        with self._changed:
-            if not self._idle and self._waiting >= self._queue:
-                raise ProblemError(Kind.RENDER_BUSY, headers={"Retry-After": "1"})
-            self._waiting += 1
-            try:
-                self._changed.wait_for(lambda: self._idle or self._closed, self._timeout)
-            finally:
-                self._waiting -= 1
-            if not self._idle:
-                raise ProblemError(Kind.RENDER_BUSY, headers={"Retry-After": "1"})
-            child = next((child for child in self._idle if child.keeps(avatar)), self._idle[0])
-            self._idle.remove(child)
-            self._busy.add(child)
-            return child
+    def _acquire(self, avatar: Path, owner: str) -> _Child:
+        with self._lock:
+            if self._idle:
+                child = next((child for child in self._idle if child.keeps(avatar)), self._idle[0])
+                self._idle.remove(child)
+                self._busy.add(child)
+                return child
+            turn = None if self._closed else self._line.join(owner)
+        if turn is None:
+            raise _busy()
+        given = turn.wait(self._timeout)
+        if given is None:
+            with self._lock:
+                self._line.leave(turn)
+                given = turn.given  # it may have come at the last moment
+        if given is None:
+            raise _busy()
+        return given
 
     def _give_back(self, child: _Child, *, healthy: bool) -> None:
         if not healthy:
             child.stop(0.0)
-        with self._changed:
+        with self._lock:
             self._busy.discard(child)
-            if not self._closed:
-                self._idle.append(child if healthy else _Child(self._loader, self._warm))
-            self._changed.notify()
+            if self._closed:
+                return
+            free = child if healthy else _Child(self._loader, self._warm)
+            # Handed on, not put back: who asks just now may not overtake those who wait.
+            if self._line.serve(free):
+                self._busy.add(free)
+            else:
+                self._idle.append(free)
+
+
+def _busy() -> ProblemError:
+    return ProblemError(Kind.RENDER_BUSY, headers={"Retry-After": "1"})
 
 
 class _Child:
@@ -244,9 +260,9 @@ def encode(image: NDArray[np.uint8], format_name: str) -> bytes:
     import numpy as np
 
     if format_name == "jpeg":
-        alpha = image[..., 3:].astype(np.float32) / 255.0
-        flat = image[..., :3] * alpha + 255.0 * (1.0 - alpha)
-        pixels = cv2.cvtColor(np.rint(flat).astype(np.uint8), cv2.COLOR_RGB2BGR)
+        alpha = cv2.cvtColor(np.ascontiguousarray(image[..., 3]), cv2.COLOR_GRAY2BGR)
+        hand = cv2.multiply(cv2.cvtColor(image, cv2.COLOR_RGBA2BGR), alpha, scale=1.0 / 255.0)
+        pixels = cv2.add(hand, cv2.bitwise_not(alpha))
         options = [cv2.IMWRITE_JPEG_QUALITY, 92]
     else:
         pixels = cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA)

@@ -12,6 +12,7 @@ from fastapi import Depends, Request
 from service.access.keys import Caller
 from service.access.links import Signer, service_secret
 from service.access.quotas import Quota
+from service.drawing import Drawing
 from service.jobs.idempotency import IdempotencyKeys
 from service.jobs.model import FINAL_STATES, Job, JobKind, JobState, is_job_id
 from service.jobs.store import JobStore, create_store
@@ -39,6 +40,7 @@ class Services:
     queue: JobQueue
     pool: RenderPool
     pictures: PictureCache
+    drawing: Drawing
     signer: Signer
     streams: StreamSlots
     outbox: Outbox
@@ -53,18 +55,14 @@ class Services:
 
     def artifact(self, job_id: str, caller: Caller) -> str:
         """The name of the job's result directory. Raises ProblemError (404, 409)."""
-        job = self.job(job_id, caller)
-        if job.state == JobState.SUCCEEDED and job.artifact is not None:
-            return job.artifact
-        if job.state in FINAL_STATES:
-            raise ProblemError(Kind.JOB_NO_RESULT, f"The job is {job.state}.")
-        raise ProblemError(Kind.JOB_NOT_READY, f"The job is {job.state}.", headers={"Retry-After": "5"})
+        return _artifact(self.job(job_id, caller))
 
     def avatar(self, job_id: str, caller: Caller) -> str:
         """:meth:`artifact` of a job that made an avatar. Raises ProblemError (404, 409)."""
-        if self.job(job_id, caller).kind != JobKind.FIT:
+        job = self.job(job_id, caller)
+        if job.kind != JobKind.FIT:
             raise ProblemError(Kind.JOB_NO_RESULT, "It made a motion, not a hand; see its assets.")
-        return self.artifact(job_id, caller)
+        return _artifact(job)
 
     def quota(self, caller: Caller) -> Quota:
         """What the caller may have."""
@@ -72,6 +70,14 @@ class Services:
         return (
             Quota(chosen.quota_jobs, chosen.quota_bytes, chosen.quota_minutes) if caller.limited else Quota()
         )
+
+
+def _artifact(job: Job) -> str:
+    if job.state == JobState.SUCCEEDED and job.artifact is not None:
+        return job.artifact
+    if job.state in FINAL_STATES:
+        raise ProblemError(Kind.JOB_NO_RESULT, f"The job is {job.state}.")
+    raise ProblemError(Kind.JOB_NOT_READY, f"The job is {job.state}.", headers={"Retry-After": "5"})
 
 
 @contextmanager
@@ -86,6 +92,7 @@ def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
         pool = create_pool(settings, loader)
         stack.callback(pool.close)
         pool.start()
+        pictures, metrics = PictureCache(settings.render_cache_bytes), Metrics(store)
         signer = Signer(service_secret(settings.secret.get_secret_value(), settings.data_dir))
         yield Services(
             settings=settings,
@@ -95,11 +102,12 @@ def open_services(settings: Settings, loader: Loader) -> Iterator[Services]:
             storage=storage,
             queue=queue,
             pool=pool,
-            pictures=PictureCache(settings.render_cache_bytes),
+            pictures=pictures,
+            drawing=Drawing(pool, pictures, metrics, settings.render_workers + settings.render_queue),
             signer=signer,
             streams=StreamSlots(settings.max_streams),
             outbox=Outbox(store.engine),
-            metrics=Metrics(store),
+            metrics=metrics,
         )
 
 

@@ -36,6 +36,10 @@ class Settings(BaseSettings):
 
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)
+    #: A port for /metrics alone, which the public one then does not have; 0 takes a free one (the log names
+    #: it). No key is asked for there, so it is for the network of whoever watches.
+    metrics_port: int | None = Field(default=None, ge=0, le=65535)
+    metrics_host: str = "127.0.0.1"
     #: Host headers answered to, besides loopback names and ``host``. "*" accepts any.
     allowed_hosts: list[str] = Field(default_factory=list)
 
@@ -47,6 +51,14 @@ class Settings(BaseSettings):
     quota_jobs: int = Field(default=20, ge=0)
     quota_bytes: int = Field(default=20 * GIB, ge=0)
     quota_minutes: float = Field(default=600.0, ge=0)
+
+    #: Requests a second that one owner of keys, and one address, may send in the long run (429 beyond); 0 is
+    #: no limit. Far above what the page, the client and a film of pictures need. An address of this machine
+    #: is not limited: a proxy there must say whom it speaks for (X-Forwarded-For).
+    rate_owner: float = Field(default=100.0, ge=0)
+    rate_address: float = Field(default=200.0, ge=0)
+    #: How many seconds' worth of requests may come at once.
+    rate_burst_seconds: float = Field(default=10.0, gt=0)
 
     max_upload_bytes: int = Field(default=2 * GIB, gt=0)
     max_video_seconds: float = Field(default=600.0, gt=0)

@@ -6,24 +6,18 @@ writes the video straight to where it stays, looks at its first bytes, and stops
 
 from __future__ import annotations
 
-import errno
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
-import anyio
 from fastapi import Request
-from fastapi.concurrency import run_in_threadpool
 from pydantic import ValidationError
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
-from starlette.requests import ClientDisconnect
 
 from service.jobs.schemas import JobOptions
 from service.problems import Kind, ProblemError, field_errors
+from service.receiving import receive
 from service.storage import Storage
 
 #: What a form may weigh besides its video: boundaries, headers, options.
@@ -31,9 +25,6 @@ FORM_OVERHEAD = 1 << 20
 _MAX_OPTIONS = 64 * 1024
 _SNIFF = 12
 _ROOM_EVERY = 64 * 1024**2
-_STALL_SECONDS = 60.0
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -66,25 +57,8 @@ async def receive_form(
     The caller removes ``target`` when this raises.
     """
     form = _Form(request.headers.get("content-type", ""), target, storage, max_video_bytes)
-    stream = request.stream()
-    chunk: bytes | None = b""
     try:
-        while True:
-            with anyio.fail_after(_STALL_SECONDS):
-                chunk = await anext(stream, None)
-            if chunk is None:
-                break
-            await run_in_threadpool(form.guarded, partial(form.feed, chunk))
-        return await run_in_threadpool(form.guarded, form.finish)
-    except ProblemError as refusal:
-        refusal.unread = chunk is not None
-        raise
-    except ClientDisconnect as error:
-        raise ProblemError(Kind.UPLOAD_INCOMPLETE) from error
-    except TimeoutError as error:
-        stalled = ProblemError(Kind.UPLOAD_STALLED)
-        stalled.unread = True
-        raise stalled from error
+        return await receive(request, form.feed, form.finish)
     finally:
         form.close()
 
@@ -152,17 +126,6 @@ class _Form:
             self._file.close()
             raise ProblemError(Kind.REQUEST_MALFORMED, "The form's boundary is too long.") from error
 
-    def guarded(self, step: Callable[[], T]) -> T:
-        """Run ``step``, turning the ways a form or a disk fails into problems."""
-        try:
-            return step()
-        except FormParserError as error:
-            raise ProblemError(Kind.REQUEST_MALFORMED, "The form's multipart encoding is broken.") from error
-        except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise ProblemError(Kind.STORAGE_FULL, headers={"Retry-After": "60"}) from error
-            raise
-
     def feed(self, chunk: bytes) -> None:
         """Take the next bytes of the body."""
         self._received += len(chunk)
@@ -172,7 +135,10 @@ class _Form:
             self._room_at += _ROOM_EVERY
             if not self._storage.has_room():
                 raise ProblemError(Kind.STORAGE_FULL, headers={"Retry-After": "60"})
-        self._parser.write(chunk)
+        try:
+            self._parser.write(chunk)
+        except FormParserError as error:
+            raise ProblemError(Kind.REQUEST_MALFORMED, "The form's multipart encoding is broken.") from error
 
     def finish(self) -> ReceivedForm:
         """The body has ended: check that it was whole."""

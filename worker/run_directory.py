@@ -13,7 +13,7 @@ import stat
 import tarfile
 from pathlib import Path
 
-from service.jobs.store import Claim
+from service.jobs.leases import Claim
 from service.storage import Storage
 from worker.sandbox import SCRATCH
 

@@ -17,8 +17,9 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.jobs.housekeeping import purge_deleted
+from service.jobs.leases import LOST_ADVICE, Claim, Heartbeat
 from service.jobs.model import FINAL_STATES, JobKind
-from service.jobs.store import LOST_ADVICE, Claim, Heartbeat, JobStore
+from service.jobs.store import JobStore
 from service.logs import about, trace_of
 from service.queue import JobQueue
 from service.settings import Settings

@@ -36,6 +36,15 @@ class PosedHand:
     joints: Tensor
     bone_transforms: Tensor
 
+    def moved(self, shift: Tensor) -> PosedHand:
+        """The hand elsewhere: as if ``shift`` [...,3] had been added to the pose's ``transl``."""
+        offset = torch.nn.functional.pad(shift[..., None, :, None], (3, 0, 0, 1))  # [...,1,4,4]
+        return PosedHand(
+            self.vertices + shift.unsqueeze(-2),
+            self.joints + shift.unsqueeze(-2),
+            self.bone_transforms + offset,
+        )
+
 
 @dataclass(frozen=True)
 class HandModel:

@@ -17,6 +17,7 @@ from starlette.types import Scope as AsgiScope
 
 from service.access.keys import ANYONE, Caller, KeyStore, Scope
 from service.access.links import Signer, is_signed
+from service.access.rates import RateLimiter, network
 from service.problems import Kind, ProblemError, ProblemResponse
 
 #: Paths (and what lies below those that end in a slash) that say nothing about anybody's jobs.
@@ -45,11 +46,15 @@ def is_public(path: str) -> bool:
 
 
 class Gate:
-    """ASGI middleware: puts the :class:`Caller` into the request's state."""
+    """ASGI middleware: puts the :class:`Caller` into the request's state.
 
-    def __init__(self, app: ASGIApp, *, keyed: bool) -> None:
+    ``addresses`` and ``owners`` say how often one of them may ask.
+    """
+
+    def __init__(self, app: ASGIApp, *, keyed: bool, addresses: RateLimiter, owners: RateLimiter) -> None:
         self._app = app
         self._keyed = keyed
+        self._addresses, self._owners = addresses, owners
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         """Admit or refuse."""
@@ -57,7 +62,10 @@ class Gate:
             await self._app(scope, receive, send)
             return
         try:
+            # Before the key: whoever has none may not ask the database without end either.
+            _count(self._addresses, network((scope.get("client") or ("",))[0]))
             caller = await self._caller(scope)
+            _count(self._owners, caller.owner if caller.limited else None)
         except ProblemError as refusal:
             headers = Headers(scope=scope)
             refusal.unread = "content-length" in headers or "transfer-encoding" in headers
@@ -89,7 +97,14 @@ class Gate:
         return found
 
 
-def _caller(request: Request) -> Caller:
+def _count(limiter: RateLimiter, who: str | None) -> None:
+    """Raise ProblemError (429) when that was one too many."""
+    wait = limiter.take(who) if who else 0
+    if wait:
+        raise ProblemError(Kind.RATE, headers={"Retry-After": str(wait)})
+
+
+async def _caller(request: Request) -> Caller:  # async: a plain function would be sent to a worker thread
     return cast(Caller, request.state.caller)
 
 

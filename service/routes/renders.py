@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,10 +10,11 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.access.gate import CallerDep
+from service.access.keys import Caller
 from service.jobs.model import JobKind
 from service.jobs.schemas import JobPage, JobView, MotionRequest, job_view
 from service.motions import canonical_motion
-from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, View, canonical_view
+from service.pictures import MAX_SIDE, MIN_SIDE, Channel, PictureFormat, canonical_view
 from service.problems import Kind, ProblemError, declared
 from service.routes.jobs import Cursor, JobId, checked_cursor
 from service.routes.submission import ACCEPTED, IDEMPOTENCY, IdempotencyKey
@@ -58,7 +58,7 @@ Side = Annotated[int, Query(ge=MIN_SIDE, le=MAX_SIDE, description="Pixels.")]
         ),
     },
 )
-def render_job(
+async def render_job(
     job_id: JobId,
     request: Request,
     services: ServicesDep,
@@ -94,20 +94,16 @@ def render_job(
     ] = "rgb",
 ) -> Response:
     """Render the hand. Repeated requests are answered from a cache; use `If-None-Match`."""
-    artifact = services.avatar(job_id, caller)
     most = services.settings.max_render_pixels
     view = canonical_view(pose, camera, width, height, format, most, channel)
-    part = _folder(services.storage.published(job_id, artifact), hand)
+    artifact, part = await run_in_threadpool(_find, services, job_id, caller, hand)
     view = replace(view, hand=part.name if part.name in ("left", "right") else "")
     headers = {"ETag": view.etag(job_id, artifact), "Cache-Control": "private, no-cache"}
     if not_modified(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    picture = services.pictures.get(job_id, artifact, view)
-    if picture is not None:
-        services.metrics.renders.labels("cached").inc()
-    else:
-        picture = _draw(services, part / "avatar.safetensors", view)
-        services.pictures.put(job_id, artifact, view, picture)
+    avatar = part / "avatar.safetensors"
+    # A link says nothing about who follows it: the takers of one hand's links are one owner.
+    picture = await services.drawing.picture(job_id, artifact, avatar, view, caller.owner or job_id)
     return Response(picture, media_type=view.media_type, headers=headers)
 
 
@@ -173,16 +169,10 @@ def list_renders(
     return JobPage(jobs=[job_view(job) for job in jobs], next=following)
 
 
-def _draw(services: Services, avatar: Path, view: View) -> bytes:
-    start = time.perf_counter()
-    try:
-        picture = services.pool.render(avatar, view)
-    except ProblemError as error:
-        services.metrics.renders.labels(error.kind.code).inc()
-        raise
-    services.metrics.renders.labels("drawn").inc()
-    services.metrics.render_seconds.observe(time.perf_counter() - start)
-    return picture
+def _find(services: Services, job_id: str, caller: Caller, hand: str | None) -> tuple[str, Path]:
+    """The job's result and the folder of the hand in it. Raises ProblemError (404, 409)."""
+    artifact = services.avatar(job_id, caller)
+    return artifact, _folder(services.storage.published(job_id, artifact), hand)
 
 
 def _folder(result: Path, hand: str | None) -> Path:

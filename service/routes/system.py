@@ -86,11 +86,15 @@ def get_readiness(services: ServicesDep) -> Readiness:
     "/metrics",
     response_class=Response,
     responses={
-        200: {"description": "Prometheus text.", "content": {"text/plain": {"schema": {"type": "string"}}}}
+        200: {"description": "Prometheus text.", "content": {"text/plain": {"schema": {"type": "string"}}}},
+        **declared(Kind.NOT_FOUND),
     },
 )
 def get_metrics(services: ServicesDep) -> Response:
-    """Figures for Prometheus. Where keys are asked for, it needs one with the scope `admin`."""
+    """Figures for Prometheus. Where keys are asked for, it needs one with the scope `admin`. With a port of
+    their own (`MASS_METRICS_PORT`) they are not here."""
+    if services.settings.metrics_port is not None:
+        raise ProblemError(Kind.NOT_FOUND)
     return Response(services.metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
 

@@ -4,32 +4,24 @@ from __future__ import annotations
 
 import base64
 import binascii
-import errno
 import hashlib
 import hmac
 import os
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
-import anyio
 from fastapi import Request
-from fastapi.concurrency import run_in_threadpool
-from starlette.requests import ClientDisconnect
 
 from service.problems import Kind, ProblemError
+from service.receiving import guarded, receive
 from service.storage import Storage
 from service.tus.rows import Lock, UploadStore
 from service.uploads import container
 
 ALGORITHMS = ("sha1", "sha256")
 _SNIFF = 12
-#: Bytes between two commits, and seconds of silence before a sender is given up.
+#: Bytes between two commits.
 _COMMIT_EVERY = 8 * 1024**2
-_STALL_SECONDS = 60.0
-
-T = TypeVar("T")
 
 
 def parse_checksum(header: str | None) -> tuple[str, bytes] | None:
@@ -122,35 +114,11 @@ class Appender:
 
 async def append(request: Request, appender: Appender) -> int:
     """Write the body of ``request``; returns the new offset. Raises ProblemError."""
-    stream = request.stream()
-    chunk: bytes | None = b""
     try:
-        while True:
-            with anyio.fail_after(_STALL_SECONDS):
-                chunk = await anext(stream, None)
-            if chunk is None:
-                break
-            if chunk:
-                await run_in_threadpool(_guarded, partial(appender.feed, chunk))
-        await run_in_threadpool(_guarded, partial(appender.end, whole=True))
-    except ProblemError as refusal:
-        refusal.unread = chunk is not None
+        await receive(request, appender.feed, partial(appender.end, whole=True))
+    except ProblemError as problem:
+        if problem.kind in (Kind.UPLOAD_INCOMPLETE, Kind.UPLOAD_STALLED):
+            # Not awaited in a thread: a cancelled request may await nothing more.
+            guarded(partial(appender.end, whole=False))
         raise
-    except (ClientDisconnect, TimeoutError) as error:
-        # Not awaited in a thread: a cancelled request may await nothing more.
-        _guarded(partial(appender.end, whole=False))
-        problem = ProblemError(
-            Kind.UPLOAD_INCOMPLETE if isinstance(error, ClientDisconnect) else Kind.UPLOAD_STALLED
-        )
-        problem.unread = isinstance(error, TimeoutError)
-        raise problem from error
     return appender.safe
-
-
-def _guarded(step: Callable[[], T]) -> T:
-    try:
-        return step()
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise ProblemError(Kind.STORAGE_FULL, headers={"Retry-After": "60"}) from error
-        raise

@@ -4,9 +4,15 @@ const POSES = ["rest", "fist", "point", "pinch", "spread"];
 let current = null; // id of the job shown
 let pose = "rest";
 let timer = 0;
+let pictures = 0; // asked for so far
 
 const show = (id, on) => { $(id).hidden = !on; };
 const minutes = (s) => (s < 90 ? `${Math.ceil(s)} s` : `${Math.ceil(s / 60)} min`);
+
+function size(bytes) {
+  const [unit, name] = bytes < 1e3 ? [1, "bytes"] : bytes < 1e6 ? [1e3, "kB"] : [1e6, "MB"];
+  return `${Number((bytes / unit).toPrecision(3))} ${name}`;
+}
 
 function complain(problem) {
   show("problem", Boolean(problem));
@@ -52,19 +58,25 @@ async function send(file) {
   const request = new XMLHttpRequest(); // fetch cannot report how much was sent
   request.responseType = "json";
   request.upload.onprogress = (event) => progress("uploading", event.loaded / event.total, null, "");
-  request.onerror = () => complain({ detail: "The connection broke.", advice: "Send the video again." });
-  request.onload = () => (request.status === 202 ? watch(request.response.id) : complain(request.response));
+  const refused = (problem) => { show("job", false); complain(problem); };
+  request.onerror = () => refused({ detail: "The connection broke.", advice: "Send the video again." });
+  request.onload = () => (request.status === 202 ? watch(request.response.id) : refused(request.response));
   request.open("POST", "/jobs");
   for (const [name, value] of Object.entries(auth())) request.setRequestHeader(name, value);
   request.send(form);
+  clearTimeout(timer);
+  current = null;
   show("result", false);
+  show("preview", false);
   progress("uploading", 0, null, "");
 }
 
 function progress(state, fraction, left, message) {
   show("job", true);
-  $("state").textContent = `${state} · ${Math.round(fraction * 100)} %`;
+  const over = fraction === null; // a job that is over is not so and so far
+  $("state").textContent = over ? state : `${state} · ${Math.round(fraction * 100)} %`;
   $("left").textContent = left === null ? "" : `about ${minutes(left)} left`;
+  show("bar", !over);
   $("bar").value = fraction;
   $("message").textContent = message;
   show("cancel", false);
@@ -73,6 +85,7 @@ function progress(state, fraction, left, message) {
 
 async function watch(id) {
   clearTimeout(timer);
+  if (id !== current) show("preview", false);
   current = id;
   location.hash = id;
   let job;
@@ -86,7 +99,7 @@ async function watch(id) {
   if (current !== id) return;
   complain(job.error);
   const label = job.state === "running" && job.stage ? job.stage : job.state;
-  progress(label, job.fraction, job.time_left, job.message);
+  progress(label, job.links.cancel ? job.fraction : null, job.time_left, job.message);
   show("cancel", Boolean(job.links.cancel) && job.state !== "cancelling");
   show("delete", !job.links.cancel);
   show("result", Boolean(job.links.render));
@@ -100,7 +113,7 @@ async function watch(id) {
     show("hands", hands.length === 2);
     picture();
     $("assets").replaceChildren(...assets.map((a) => {
-      const item = row(a.name, a.href, `${(a.bytes / 1e6).toFixed(2)} MB`);
+      const item = row(a.name, a.href, size(a.bytes));
       item.firstChild.onclick = (event) => { event.preventDefault(); save(id, a.name).catch(complain); };
       return item;
     }));
@@ -116,19 +129,21 @@ async function look(job) { // the hand as it is now; there is none before it is 
 }
 
 async function picture() {
-  const camera = `orbit:${$("yaw").value},0`;
+  const asked = ++pictures;
+  const camera = `orbit:${$("yaw").value},${$("pitch").value}`;
   const query = new URLSearchParams({
-    pose, camera, width: 512, height: 512, format: "webp", channel: $("channel").value,
+    pose, camera, width: 512, height: 512, format: "png", channel: $("channel").value,
   });
   if (!$("hands").hidden) query.set("hand", $("hand").value);
   $("picture").classList.add("busy");
   for (const button of $("poses").children) button.setAttribute("aria-pressed", button.textContent === pose);
   try {
     const drawn = await (await ask(`/jobs/${current}/render?${query}`)).blob();
-    if (query.get("pose") !== pose) return; // another one has been asked for since
+    if (asked !== pictures) return; // another one has been asked for since
     URL.revokeObjectURL($("picture").src);
     $("picture").src = URL.createObjectURL(drawn);
   } catch (problem) {
+    if (asked !== pictures) return;
     $("picture").classList.remove("busy");
     complain(problem);
   }
@@ -146,7 +161,7 @@ $("poses").append(...POSES.map((name) => {
   return button;
 }));
 $("picture").onload = $("picture").onerror = () => $("picture").classList.remove("busy");
-$("yaw").onchange = $("channel").onchange = $("hand").onchange = picture;
+$("yaw").onchange = $("pitch").onchange = $("channel").onchange = $("hand").onchange = picture;
 $("file").onchange = (event) => event.target.files[0] && send(event.target.files[0]);
 $("cancel").onclick = () => call(`/jobs/${current}/cancel`, { method: "POST" }).catch(complain);
 $("delete").onclick = async () => {

@@ -79,12 +79,21 @@ def test_only_the_api_is_published_and_only_on_loopback(compose: dict[str, Any])
         assert compose["services"][name]["networks"] == ["queue"]
 
 
+def test_the_figures_are_on_a_port_that_is_not_published(compose: dict[str, Any]) -> None:
+    api = compose["services"]["api"]
+    port = api["environment"]["MASS_METRICS_PORT"]
+    assert Settings(metrics_port=int(port)).metrics_port == int(port)
+    assert not any(entry.endswith(f":{port}") for entry in api["ports"])
+    assert "queue" in api["networks"]
+
+
 def test_api_and_worker_share_one_image_user_volume_and_broker(compose: dict[str, Any]) -> None:
     api, worker = (compose["services"][name] for name in OURS)
     for key in ("image", "build", "user", "volumes", "depends_on"):
         assert api[key] == worker[key]
     shared = {name: value for name, value in worker["environment"].items() if name != "MASS_WORKER_QUEUES"}
-    assert api["environment"] == {**shared, "MASS_AUTH": "${MASS_AUTH:-open}"}
+    figures = {"MASS_METRICS_HOST": "0.0.0.0", "MASS_METRICS_PORT": "9090"}
+    assert api["environment"] == {**shared, "MASS_AUTH": "${MASS_AUTH:-open}", **figures}
     gpu = compose["services"]["worker-gpu"]
     assert {**shared, **gpu["environment"]} == gpu["environment"]
     assert gpu["environment"]["MASS_WORKER_QUEUES"] == '["gpu"]'

@@ -12,6 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 import uvicorn
+from fastapi import FastAPI
 
 from service.app import create_app
 from service.services import Services
@@ -37,6 +38,7 @@ class Live:
     services: Services
     host: str
     port: int
+    app: FastAPI
 
     def files(self) -> list[str]:
         """Every file under the uploads and jobs directories."""
@@ -83,7 +85,7 @@ def serve(settings: Settings) -> Iterator[Live]:
         # The socket listens already: the first request waits there until the app has started.
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as http:
             assert http.get("/healthz").json() == {"status": "ok"}, "it has started"
-            yield Live(http, app.state.services, "127.0.0.1", port)
+            yield Live(http, app.state.services, "127.0.0.1", port, app)
     finally:
         server.should_exit = True
         thread.join(20.0)

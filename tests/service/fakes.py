@@ -14,7 +14,7 @@ from service.rendering import RenderRefusedError
 
 
 class FakeAvatar:
-    """Flat pictures whose colour depends on everything asked for; left half transparent."""
+    """Flat pictures whose colour depends on everything asked for; left half transparent. Notes widths."""
 
     def __init__(self, folder: Path, content: bytes) -> None:
         self._folder = folder
@@ -32,6 +32,8 @@ class FakeAvatar:
             raise ValueError("a bug in the renderer")
         if pose == "unknown":
             raise RenderRefusedError("pose.unknown", "No such pose.", "Use another.", argument=True)
+        with (self._folder / "drawn").open("a") as file:
+            file.write(f"{width}\n")
         digest = hashlib.sha256(self._content + f"{pose}|{camera}|{channel}".encode()).digest()
         image = np.empty((height, width, 4), np.uint8)
         image[...] = (*digest[:3], 255)

@@ -67,6 +67,34 @@ def test_a_problem_becomes_an_error_with_its_code_advice_and_faults() -> None:
     assert str(error.value) == "The options are wrong.; seed: too small Correct them."
 
 
+def _too_often(wait: str, code: str = "rate.exceeded") -> httpx.Response:
+    return httpx.Response(429, json={"code": code, "detail": "Too often."}, headers={"retry-after": wait})
+
+
+def test_a_service_asked_too_often_is_left_alone_for_as_long_as_it_says() -> None:
+    service, made = script(_too_often("0"), _too_often("0"), httpx.Response(200, json=JOB))
+    assert service.job("j").state == "running"
+    assert len(made) == 3
+
+
+@pytest.mark.parametrize(
+    "answers",
+    [
+        [_too_often("0")] * 4,
+        [_too_often("9999")],
+        [_too_often("soon")],
+        [_too_often("0", "quota.exceeded")],
+        [httpx.Response(429)],
+    ],
+)
+def test_what_is_not_worth_waiting_for(answers: list[httpx.Response]) -> None:
+    service, made = script(*answers)
+    with pytest.raises(ServiceError) as error:
+        service.job("j")
+    assert error.value.status == 429
+    assert len(made) == len(answers)
+
+
 @pytest.mark.parametrize("body", [b"<html>Bad gateway</html>", b"[]", b"null"])
 def test_an_error_that_is_no_problem_is_still_an_error(body: bytes) -> None:
     service, _ = script(httpx.Response(502, content=body))

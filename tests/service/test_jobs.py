@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from service.jobs.housekeeping import purge_deleted, sweep_uploads
+from service.jobs.leases import Heartbeat
 from service.jobs.model import new_job_id
-from service.jobs.store import Heartbeat
 from tests.service.conftest import VIDEO, Live, problem, serve
 
 NOT_IDS = ["nope", "%2e%2e", "..%2f..", "0" * 36, "%00", "\u2603", new_job_id(), "x" * 60]

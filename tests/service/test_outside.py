@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import SecretStr
@@ -18,6 +19,7 @@ from service.access.keys import KeyStore, Scope
 from service.embedded import EmbeddedBroker
 from service.jobs.store import create_store
 from service.logs import about, configure, trace_of
+from service.metrics import own_port
 from service.pulse import pulse_path
 from service.settings import Settings
 from service.storage import Storage
@@ -109,6 +111,23 @@ def test_figures_need_an_administrators_key(tmp_path: Path) -> None:
             key = keys.create("ann", [scope])
             answer = live.http.get("/metrics", headers={"Authorization": f"Bearer {key}"})
             assert answer.status_code == status
+
+
+def test_figures_on_a_port_of_their_own(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, auth="keys", min_free_bytes=0, metrics_port=0)
+    with serve(settings) as live:
+        live.http.headers["Authorization"] = (
+            f"Bearer {KeyStore(live.services.store.engine).create('root', [Scope.ADMIN])}"
+        )
+        problem(live.http.get("/metrics"), 404, "request.not_found")
+        port = live.app.state.metrics_port
+        assert port not in (0, live.port)
+        text = httpx.get(f"http://127.0.0.1:{port}/metrics", trust_env=False).text
+        assert 'mass_jobs{state="queued"} 0.0' in text
+        with pytest.raises(OSError, match="in use"), own_port(live.services.metrics, "127.0.0.1", port):
+            pass
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(f"http://127.0.0.1:{port}/metrics", trust_env=False)
 
 
 @pytest.fixture

@@ -19,8 +19,9 @@ from service.jobs.idempotency import (
     ReservationLostError,
     parse_key,
 )
+from service.jobs.leases import Claim, Heartbeat
 from service.jobs.model import JobState, is_job_id, new_job_id
-from service.jobs.store import Cancel, Claim, Heartbeat, JobStore, create_store
+from service.jobs.store import Cancel, JobStore, create_store
 from service.settings import Settings
 
 

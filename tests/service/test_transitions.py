@@ -10,8 +10,9 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
+from service.jobs.leases import Heartbeat
 from service.jobs.model import FINAL_STATES, HELD_STATES, TRANSITIONS, Job, JobState, sources
-from service.jobs.store import Cancel, Heartbeat, create_store
+from service.jobs.store import Cancel, create_store
 from service.settings import Settings
 
 MAX_ATTEMPTS = 3

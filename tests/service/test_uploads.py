@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import socket
+import sqlite3
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from service.jobs.model import is_job_id
 from service.queue import JobQueue
@@ -206,7 +208,7 @@ def test_a_broken_connection_leaves_nothing(live: Live, monkeypatch: pytest.Monk
 
 def test_a_client_that_goes_silent_is_given_up(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     before = live.files()
-    monkeypatch.setattr("service.uploads._STALL_SECONDS", 0.2)
+    monkeypatch.setattr("service.receiving.STALL_SECONDS", 0.2)
     with socket.create_connection((live.host, live.port), timeout=20) as connection:
         connection.sendall(request_head(live, 900_000))
         connection.sendall(form(("video", VIDEO), end=False))
@@ -249,6 +251,28 @@ def test_a_failure_of_the_database_leaves_no_upload(live: Live, monkeypatch: pyt
     monkeypatch.setattr(live.services.store.__class__, "create", broken)
     body = problem(post(live, form(("video", VIDEO))), 500, "service.internal")
     assert "database" not in json.dumps(body)
+    assert live.files() == before
+
+
+@pytest.mark.parametrize(
+    ("said", "status", "code"),
+    [
+        ("database is locked", 503, "service.not_ready"),
+        ("database or disk is full", 507, "storage.full"),
+    ],
+)
+def test_a_database_that_cannot_be_written_is_no_bug(
+    live: Live, monkeypatch: pytest.MonkeyPatch, said: str, status: int, code: str
+) -> None:
+    before = live.files()
+
+    def broken(*_: object, **__: object) -> None:
+        raise OperationalError("INSERT", None, sqlite3.OperationalError(said))
+
+    monkeypatch.setattr(live.services.store.__class__, "create", broken)
+    answer = post(live, form(("video", VIDEO)))
+    assert "INSERT" not in json.dumps(problem(answer, status, code))
+    assert int(answer.headers["Retry-After"]) > 0
     assert live.files() == before
 
 

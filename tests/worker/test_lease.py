@@ -11,8 +11,9 @@ from typing import Any, cast
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from service.jobs.leases import Claim, Heartbeat
 from service.jobs.model import JobState, new_job_id
-from service.jobs.store import Claim, Heartbeat, JobStore, create_store
+from service.jobs.store import JobStore, create_store
 from service.pulse import is_fresh, live_workers, pulse_path, sweep_pulses
 from service.queue import JobQueue
 from service.settings import Settings

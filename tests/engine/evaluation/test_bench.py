@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
 from mass_engine.cli import main
-from mass_engine.evaluation import pareto, stability
+from mass_engine.errors import EngineError
+from mass_engine.evaluation import bench_raster, pareto, stability
 from mass_engine.evaluation.charts import draw_bars
 from mass_engine.evaluation.heldout import REFINED
 from mass_engine.evaluation.pareto import Point, front, variants
@@ -131,3 +133,9 @@ def test_the_best_of_every_clip(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert (out / "clips.png").stat().st_size > 1000
     assert main(["bench", "clips", str(runs[0]), "--metric", "nothing", "--out", str(out)]) == 2
     assert main(["bench", "clips", str(runs[3]), "--out", str(out)]) == 2
+
+
+def test_a_benchmark_on_a_gpu_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mass_engine.raster._cuda_kernels", None)  # as if it had not been built
+    with pytest.raises(EngineError, match=r"device\.unavailable.*make cuda"):
+        bench_raster.run(["--device", "cuda"])

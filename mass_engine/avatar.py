@@ -104,6 +104,10 @@ class Avatar:
 
     @cached_property
     def _compiled(self) -> CompiledSurfels:
+        return self.posable().compiled()
+
+    def posable(self) -> PosableSurfels:
+        """The surfels ready for posing, shared."""
         look, skin = self.appearance, self.skin
         return PosableSurfels(
             skin.binding,
@@ -114,7 +118,7 @@ class Avatar:
             look.light,
             None if skin.deformation is None else skin.deformation.freeze(),
             skin.detached_from,
-        ).compiled()
+        )
 
     def _shaded(self, pose: HandPose, camera: Camera) -> ShadedSurfels:
         """The surfels in one pose (a batch of one) as ``camera`` sees them."""
@@ -172,12 +176,18 @@ class Avatar:
         channel: str = "rgb",
     ) -> ChannelImage:
         """One channel of a pose seen by a camera. Raises BadArgumentError for a bad specification."""
+        wanted = parse_channel(channel)
+        return self.image(*self.resolve_view(pose_spec, camera_spec, width, height), wanted)
+
+    def resolve_view(
+        self, pose_spec: str, camera_spec: str, width: int, height: int
+    ) -> tuple[HandPose, Camera]:
+        """A placed pose (batch of one) and the camera that sees it. Raises BadArgumentError."""
         if not (1 <= width <= 16384 and 1 <= height <= 16384):
             raise BadArgumentError("size.invalid", f"{width}x{height} is not a picture.", "Use 1 to 16384.")
-        wanted = parse_channel(channel)
         pose = self.resolve_pose(pose_spec)
         center, radius = self._bounds(pose)
-        return self.image(pose, parse_camera(camera_spec, self.camera, width, height, center, radius), wanted)
+        return pose, parse_camera(camera_spec, self.camera, width, height, center, radius)
 
     def render(
         self,

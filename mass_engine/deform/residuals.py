@@ -72,8 +72,8 @@ def deform(
 ) -> AttachedSurfels:
     """The deformed surfels; differentiable in both. Shapes [B,N] as in ``Residuals``, or any other [...].
 
-    float32 is compiled, anything else is ``deform_reference``. ``threads``: None is every core this process
-    may use. Raises BadArgumentError ``deform.shape`` and ``deform.instruction_set``.
+    float32 on the CPU is compiled, anything else is ``deform_reference``. ``threads``: None is every core
+    this process may use. Raises BadArgumentError ``deform.shape`` and ``deform.instruction_set``.
     """
     tensors = (
         surfels.means,
@@ -89,7 +89,7 @@ def deform(
         raise BadArgumentError(
             "deform.shape", f"Surfels and residuals are {shapes}.", "Give a residual for each surfel."
         )
-    if any(tensor.dtype != torch.float32 for tensor in tensors):
+    if any(tensor.dtype != torch.float32 or tensor.device.type != "cpu" for tensor in tensors):
         return deform_reference(surfels, residuals)
     kernels = shared_kernels(instruction_set)
     out = _Deform.apply(kernels, threads or available_threads(), *tensors)  # type: ignore[no-untyped-call]

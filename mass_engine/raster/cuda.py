@@ -26,8 +26,11 @@ from mass_engine.raster.types import Convention, Extras, RasterOptions, RenderOu
 if TYPE_CHECKING:
     from mass_engine.raster import _cuda_kernels
 
+#: Where a frame's counters say what went wrong (0: nothing), and what they say.
+STATUS = 2
 _OVERFLOW, _BAD_CAMERA = 1, 2
-_MOST_PAIRS = (1 << 31) - 1
+#: Room for more pairs than this cannot be asked for.
+MOST_PAIRS = (1 << 31) - 1
 # Room in the first frame: pairs a surfel, and pairs whatever the number of surfels.
 _PAIRS_PER_SURFEL, _LEAST_PAIRS = 4, 1 << 16
 
@@ -45,7 +48,7 @@ class Backend:
 
     def needed(self, pairs: int) -> None:
         """Remember a frame's pairs, with an eighth to spare."""
-        self._room = max(self._room, min(pairs + pairs // 8, _MOST_PAIRS))
+        self._room = max(self._room, min(pairs + pairs // 8, MOST_PAIRS))
 
 
 def import_kernels() -> Any:
@@ -188,7 +191,7 @@ class _Rasterize(torch.autograd.Function):
                 if fixed:
                     break
                 _, call.pairs, status = counters.tolist()
-                if not status & _OVERFLOW or call.pairs >= _MOST_PAIRS:
+                if not status & _OVERFLOW or call.pairs >= MOST_PAIRS:
                     call.dropped = check_counters(counters)
                     break
                 backend.needed(call.pairs)

@@ -1,0 +1,61 @@
+// Python bindings. Arrays are DLPack views of contiguous tensors on the GPU (on the CPU in the emulation); the callers have
+// checked their shapes. Nothing waits for the GPU.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+
+#include <optional>
+
+#include "device_error.hpp"
+#include "passes.hpp"
+#if defined(MASS_EMULATED)
+#include "emulator.hpp"
+#endif
+
+namespace nb = nanobind;
+
+namespace {
+
+#if defined(MASS_EMULATED)
+using Place = nb::device::cpu;
+#else
+using Place = nb::device::cuda;
+#endif
+using In = nb::ndarray<const float, nb::c_contig, Place>;
+using Out = nb::ndarray<float, nb::c_contig, Place>;
+using Index = nb::ndarray<const int32_t, nb::c_contig, Place>;
+
+void* pointer(uintptr_t stream) { return reinterpret_cast<void*>(stream); }
+
+mass::gpu::Pictures pictures(const In& seen, const In& wanted, const In& inside) {
+    const int height = static_cast<int>(inside.shape(0)), width = static_cast<int>(inside.shape(1));
+    return {seen.data(), wanted.data(), inside.data(), height, width};
+}
+
+void product(uintptr_t stream, const Index& begins, const Index& columns, const In& values, const In& dense, bool few, Out& out) {
+    const mass::gpu::Rows rows{begins.data(), columns.data(), values.data(), static_cast<int>(begins.size()) - 1};
+    mass::gpu::product(rows, dense.data(), static_cast<int>(dense.shape(1)), few, out.data(), out.device_id(), pointer(stream));
+}
+
+void ssim(uintptr_t stream, const In& seen, const In& wanted, const In& inside, Out& sums, std::optional<Out> slopes) {
+    mass::gpu::ssim(pictures(seen, wanted, inside), sums.data(), slopes ? slopes->data() : nullptr, sums.device_id(), pointer(stream));
+}
+
+void ssim_backward(uintptr_t stream, const In& seen, const In& wanted, const In& inside, const In& slopes, const In& scale, Out& d_seen) {
+    mass::gpu::ssim_backward(pictures(seen, wanted, inside), slopes.data(), scale.data(), d_seen.data(), d_seen.device_id(), pointer(stream));
+}
+
+}  // namespace
+
+NB_MODULE(_kernels, m) {
+    m.doc() = "What a fit does beside rasterising, on the GPU (see mass_engine.gpu).";
+    nb::set_leak_warnings(false);
+    nb::exception<mass::DeviceError>(m, "DeviceError", PyExc_RuntimeError);
+    m.def("ssim_blocks", &mass::gpu::ssim_blocks);
+    m.def("product", &product);
+    m.def("ssim", &ssim, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());
+    m.def("ssim_backward", &ssim_backward);
+#if defined(MASS_EMULATED)
+    m.def("reverse_threads", [](bool reverse) { mass::emulator::machine().reverse = reverse; }, "The order in which threads run.");
+#endif
+}

@@ -1,4 +1,4 @@
-"""What a fit does beside rasterising, on a GPU: fixed sparse products and the structural loss.
+"""What a fit does beside rasterising, on a GPU: fixed sparse products, the deformation, the structural loss.
 
 The kernels (``kernels/``, CUDA C++17) are an optional module (docs/gpu.md); without them the same is done by
 torch's operators. They run on torch's current stream, wait for nothing and sum in a fixed order.
@@ -7,6 +7,7 @@ torch's operators. They run on torch's current stream, wait for nothing and sum 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -39,6 +40,14 @@ def sparse_product(kernels: Any, matrix: Tensor, dense: Tensor) -> Tensor:
     few = len(values) <= _FEW * len(out)
     kernels.product(_stream(dense), begins, columns, values, dense, few, out)
     return out
+
+
+def deform_passes(kernels: Any) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Forward and backward of what residuals do to surfels, for ``deform.residuals.deform_by``."""
+    return (
+        lambda *tensors: kernels.deform(_stream(tensors[0]), *tensors),
+        lambda *tensors: kernels.deform_backward(_stream(tensors[0]), *tensors),
+    )
 
 
 def dssim(kernels: Any, seen: Tensor, wanted: Tensor, inside: Tensor) -> Tensor:

@@ -4,6 +4,36 @@ def ssim_blocks(height: int, width: int) -> int: ...
 def product(
     stream: int, begins: Tensor, columns: Tensor, values: Tensor, dense: Tensor, few: bool, out: Tensor, /
 ) -> None: ...
+def deform(
+    stream: int,
+    means: Tensor,
+    tangents: Tensor,
+    normals: Tensor,
+    offset: Tensor,
+    log_scale: Tensor,
+    rotation: Tensor,
+    means_out: Tensor,
+    tangents_out: Tensor,
+    normals_out: Tensor,
+    /,
+) -> None: ...
+def deform_backward(
+    stream: int,
+    tangents: Tensor,
+    normals: Tensor,
+    offset: Tensor,
+    log_scale: Tensor,
+    rotation: Tensor,
+    d_means_out: Tensor,
+    d_tangents_out: Tensor,
+    d_normals_out: Tensor,
+    d_tangents: Tensor,
+    d_normals: Tensor,
+    d_offset: Tensor,
+    d_log_scale: Tensor,
+    d_rotation: Tensor,
+    /,
+) -> None: ...
 def ssim(
     stream: int, seen: Tensor, wanted: Tensor, inside: Tensor, sums: Tensor, slopes: Tensor | None, /
 ) -> None: ...

@@ -45,6 +45,22 @@ void ssim_backward(uintptr_t stream, const In& seen, const In& wanted, const In&
     mass::gpu::ssim_backward(pictures(seen, wanted, inside), slopes.data(), scale.data(), d_seen.data(), d_seen.device_id(), pointer(stream));
 }
 
+void deform(uintptr_t stream, const In& means, const In& tangents, const In& normals, const In& offset, const In& log_scale,
+            const In& rotation, Out& means_out, Out& tangents_out, Out& normals_out) {
+    const mass::ResidualData d{means.data(), tangents.data(), normals.data(), offset.data(), log_scale.data(), rotation.data()};
+    mass::gpu::deform(d, means_out.data(), tangents_out.data(), normals_out.data(), static_cast<int>(means.size() / 3), means.device_id(),
+                      pointer(stream));
+}
+
+void deform_backward(uintptr_t stream, const In& tangents, const In& normals, const In& offset, const In& log_scale, const In& rotation,
+                     const In& d_means_in, const In& d_tangents_in, const In& d_normals_in, Out& d_tangents, Out& d_normals, Out& d_offset,
+                     Out& d_log_scale, Out& d_rotation) {
+    const mass::ResidualData d{nullptr, tangents.data(), normals.data(), offset.data(), log_scale.data(), rotation.data()};
+    const mass::ResidualGradient g{d_means_in.data(), d_tangents_in.data(), d_normals_in.data(), d_tangents.data(),
+                                   d_normals.data(), d_offset.data(), d_log_scale.data(), d_rotation.data()};
+    mass::gpu::deform_backward(d, g, static_cast<int>(normals.size() / 3), normals.device_id(), pointer(stream));
+}
+
 }  // namespace
 
 NB_MODULE(_kernels, m) {
@@ -55,6 +71,8 @@ NB_MODULE(_kernels, m) {
     m.def("product", &product);
     m.def("ssim", &ssim, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());
     m.def("ssim_backward", &ssim_backward);
+    m.def("deform", &deform);
+    m.def("deform_backward", &deform_backward);
 #if defined(MASS_EMULATED)
     m.def("reverse_threads", [](bool reverse) { mass::emulator::machine().reverse = reverse; }, "The order in which threads run.");
 #endif

@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "residual_types.hpp"
+
 namespace mass::gpu {
 
 // A sparse matrix by rows: those of row r are at begins[r] .. begins[r + 1] - 1.
@@ -34,5 +36,9 @@ inline int ssim_blocks(int height, int width) {
 void ssim(const Pictures& p, float* sums, float* slopes, int device, void* stream);
 // d_seen [height,width,3] of scale * the sum over all blocks.
 void ssim_backward(const Pictures& p, const float* slopes, const float* scale, float* d_seen, int device, void* stream);
+
+// What residuals do to surfels, [rows,...] each; the gradient of the means passes unchanged.
+void deform(const ResidualData& d, float* means, float* tangents, float* normals, int rows, int device, void* stream);
+void deform_backward(const ResidualData& d, const ResidualGradient& g, int rows, int device, void* stream);
 
 }  // namespace mass::gpu

@@ -14,6 +14,8 @@
 #define MASS_INLINE static inline __attribute__((always_inline))
 #endif
 
+#define MASS_ENTRY MASS_INLINE
+
 namespace mass::MASS_ISA {
 
 // A tile's arrays shrink to the thread's own pixel.

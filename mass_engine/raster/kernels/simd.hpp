@@ -21,6 +21,7 @@
 #endif
 
 #define MASS_INLINE static inline __attribute__((always_inline))
+#define MASS_ENTRY inline  // called by its address
 
 namespace mass::MASS_ISA {
 

@@ -10,13 +10,13 @@ import pytest
 from tests.emulation import ROOT, build
 
 KERNELS = ROOT / "mass_engine" / "gpu" / "kernels"
-RASTER = ROOT / "mass_engine" / "raster" / "kernels"
+OTHERS = [ROOT / "mass_engine" / part / "kernels" for part in ("raster", "deform")]
 
 
 @pytest.fixture(scope="session")
 def built() -> ModuleType:
     """Compiled once a session, if anything changed."""
-    return build("_kernels", [*sorted(KERNELS.glob("*.cu")), KERNELS / "module.cpp"], [KERNELS, RASTER])
+    return build("_kernels", [*sorted(KERNELS.glob("*.cu")), KERNELS / "module.cpp"], [KERNELS, *OTHERS])
 
 
 @pytest.fixture(params=[False, True], ids=["forwards", "backwards"])

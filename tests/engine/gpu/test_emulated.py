@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import ModuleType
 
 import numpy as np
@@ -12,8 +13,12 @@ from torch import Tensor
 
 from mass_engine import gpu
 from mass_engine.deform.hashgrid import HashGrid, HashGridConfig
+from mass_engine.deform.residuals import Residuals, deform_by, deform_reference
 from mass_engine.fitting import losses
+from mass_engine.surfel.binding import AttachedSurfels
 from mass_engine.surfel.fixed_product import to_torch_csr
+
+Way = Callable[[AttachedSurfels, Residuals], AttachedSurfels]
 
 
 def fixed(rows: int, columns: int, each: int, seed: int) -> sp.csr_array:
@@ -97,3 +102,33 @@ def test_the_fit_uses_the_kernels_where_there_are_any(
     monkeypatch.setattr(gpu, "kernels_for", lambda _: emulated)
     seen, wanted, inside = pictures(30, 30, 4)
     assert float(losses.dssim(seen, wanted, inside)) == float(gpu.dssim(emulated, seen, wanted, inside))
+
+
+@pytest.mark.parametrize("count", [1, 300])
+def test_what_residuals_do_to_surfels_and_its_gradient(emulated: ModuleType, count: int) -> None:
+    random = torch.Generator().manual_seed(count)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(2, count, *shape, generator=random)
+
+    normals = torch.nn.functional.normalize(normal(3), dim=-1)
+    across = torch.linalg.cross(normals, normal(3))
+    tangents = 1e-3 * torch.stack([across, torch.linalg.cross(normals, across) + 0.2 * across], -2)
+    given = (normal(3), tangents, normals, 1e-3 * normal(3), 0.3 * normal(2), 0.2 * normal(3))
+    weights = (normal(3), 1e3 * normal(2, 3), normal(3))
+
+    def results(
+        way: Callable[[AttachedSurfels, Residuals], AttachedSurfels], *values: Tensor
+    ) -> list[Tensor]:
+        leaves = [value.clone().requires_grad_(True) for value in values]
+        out = way(AttachedSurfels(*leaves[:3]), Residuals(*leaves[3:], normal()))
+        images = (out.means, out.tangents, out.normals)
+        upstream = [weight.to(values[0]) for weight in weights]
+        return [*(i.detach() for i in images), *torch.autograd.grad(images, leaves, upstream)]
+
+    passes = gpu.deform_passes(emulated)
+    found = results(lambda surfels, changes: deform_by(passes, surfels, changes), *given)
+    wanted = results(deform_reference, *(value.double() for value in given))
+    for mine, other in zip(found, wanted, strict=True):
+        scale = float(other.abs().max())
+        torch.testing.assert_close(mine.double(), other, rtol=1e-4, atol=2e-6 * scale)

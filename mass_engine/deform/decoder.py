@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from mass_engine import gpu
 from mass_engine.deform import _kernels
 from mass_engine.deform.native import shared_kernels
 from mass_engine.deform.precision import product
@@ -68,8 +69,11 @@ def decode(
         raise BadArgumentError(
             "deform.shape", f"The decoder's tensors are {shapes}.", "Give N,H; B,H; H,H; H; H,9 and 9."
         )
-    plain = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
-    if hidden % 16 or hidden > 128 or not plain:
+    plain = all(tensor.dtype == torch.float32 for tensor in tensors)
+    on_gpu = gpu.kernels_for(surfel_share)
+    if on_gpu is not None and plain and hidden in gpu.DECODER_WIDTHS and len(surfel_share):
+        return Residuals(*gpu.decode(on_gpu, units, *tensors))
+    if hidden % 16 or hidden > 128 or not plain or surfel_share.device.type != "cpu":
         return decode_reference(surfel_share, pose_share, layers, units)
     kernels = shared_kernels(instruction_set)
     out = _Decode.apply(kernels, threads or available_threads(), units, *tensors)  # type: ignore[no-untyped-call]

@@ -74,7 +74,8 @@ def deform(
     """The deformed surfels; differentiable in both. Shapes [B,N] as in ``Residuals``, or any other [...].
 
     float32 is compiled (for a GPU if its kernels are built), anything else is ``deform_reference``.
-    ``threads``: None is every core this process may use. Raises BadArgumentError ``deform.shape`` and ``deform.instruction_set``.
+    ``threads``: None is every core this process may use. Raises BadArgumentError ``deform.shape`` and
+    ``deform.instruction_set``.
     """
     tensors = (
         surfels.means,

@@ -50,6 +50,50 @@ def deform_passes(kernels: Any) -> tuple[Callable[..., None], Callable[..., None
     )
 
 
+#: Widths of the decoder that there are kernels for.
+DECODER_WIDTHS = (16, 32, 48, 64)
+
+
+def decode(
+    kernels: Any, units: tuple[float, float], surfel_share: Tensor, pose_share: Tensor, *layers: Tensor
+) -> tuple[Tensor, ...]:
+    """As ``deform.decoder.decode``: offset [B,N,3], log-scale [B,N,2], rotation [B,N,3], mask logit [B,N].
+
+    ``layers``: second, its bias, head, its bias. ``units`` of offset and rotation.
+    """
+    out: tuple[Tensor, ...] = _Decode.apply(kernels, units, surfel_share, pose_share, *layers)  # type: ignore[no-untyped-call]
+    return out
+
+
+class _Decode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, kernels: Any, units: tuple[float, float], *tensors: Tensor) -> tuple[Tensor, ...]:
+        given = [tensor.detach().contiguous() for tensor in tensors]
+        share, pose = given[:2]
+        lead = (len(pose), len(share))
+        out = tuple(share.new_empty(*lead, *end) for end in ((3,), (2,), (3,), ()))
+        kernels.decode(_stream(share), *given, *units, *out)
+        ctx.kernels, ctx.units = kernels, units
+        ctx.save_for_backward(*given, out[1])
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *given, log_scale = ctx.saved_tensors
+        share, pose, *layers = given
+        arrived = [gradient.contiguous() for gradient in gradients]
+        d_share = torch.empty_like(share)
+        size = ctx.kernels.decoder_sums(share.shape[1], len(pose))
+        partial = share.new_empty(ctx.kernels.decoder_blocks(len(share)), size)
+        sums = share.new_empty(size)
+        ctx.kernels.decode_backward(
+            _stream(share), *given, *ctx.units, *arrived, log_scale, d_share, partial, sums
+        )
+        parts = sums.split([value.numel() for value in (*layers, pose)])
+        *d_layers, d_pose = (part.view(v.shape) for part, v in zip(parts, (*layers, pose), strict=True))
+        return (None, None, d_share, d_pose, *d_layers)
+
+
 def dssim(kernels: Any, seen: Tensor, wanted: Tensor, inside: Tensor) -> Tensor:
     """As ``fitting.losses.dssim``; differentiable in ``seen`` alone."""
     loss: Tensor = _Dssim.apply(kernels, seen, wanted.detach(), inside.detach())  # type: ignore[no-untyped-call]

@@ -64,5 +64,6 @@ def pretend_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a GPU, where sparse products, the deformation and the structural loss have kernels."""
     monkeypatch.setattr(gpu, "kernels_for", lambda _: gpu)
     monkeypatch.setattr(gpu, "sparse_product", lambda _, m, d: d.new_zeros(m.shape[0], d.shape[1]))
+    monkeypatch.setattr(gpu, "DECODER_WIDTHS", ())
     monkeypatch.setattr(gpu, "deform_passes", lambda _: (lambda *_: None, lambda *_: None))
     monkeypatch.setattr(gpu, "dssim", lambda _, seen, wanted, inside: (seen.sum(-1) * inside).sum())

@@ -45,6 +45,37 @@ void ssim_backward(uintptr_t stream, const In& seen, const In& wanted, const In&
     mass::gpu::ssim_backward(pictures(seen, wanted, inside), slopes.data(), scale.data(), d_seen.data(), d_seen.device_id(), pointer(stream));
 }
 
+mass::DecoderData decoder(const In& share, const In& pose, const In& second, const In& second_bias, const In& head, const In& head_bias,
+                         float offset_unit, float rotation_unit) {
+    mass::DecoderData d{};
+    d.share = share.data();
+    d.pose = pose.data();
+    d.second = second.data();
+    d.second_bias = second_bias.data();
+    d.head = head.data();
+    d.head_bias = head_bias.data();
+    d.offset_unit = offset_unit;
+    d.rotation_unit = rotation_unit;
+    d.count = static_cast<int>(share.shape(0));
+    d.hidden = static_cast<int>(share.shape(1));
+    d.batch = static_cast<int>(pose.shape(0));
+    return d;
+}
+
+void decode(uintptr_t stream, const In& share, const In& pose, const In& second, const In& second_bias, const In& head,
+            const In& head_bias, float offset_unit, float rotation_unit, Out& offset, Out& log_scale, Out& rotation, Out& mask_logit) {
+    const mass::DecoderData d = decoder(share, pose, second, second_bias, head, head_bias, offset_unit, rotation_unit);
+    mass::gpu::decode(d, {offset.data(), log_scale.data(), rotation.data(), mask_logit.data()}, share.device_id(), pointer(stream));
+}
+
+void decode_backward(uintptr_t stream, const In& share, const In& pose, const In& second, const In& second_bias, const In& head,
+                     const In& head_bias, float offset_unit, float rotation_unit, const In& d_offset, const In& d_log_scale,
+                     const In& d_rotation, const In& d_mask_logit, const In& log_scale, Out& d_share, Out& partial, Out& sums) {
+    const mass::DecoderData d = decoder(share, pose, second, second_bias, head, head_bias, offset_unit, rotation_unit);
+    const mass::ResidualRowGradients g{d_offset.data(), d_log_scale.data(), d_rotation.data(), d_mask_logit.data(), log_scale.data()};
+    mass::gpu::decode_backward(d, g, d_share.data(), partial.data(), sums.data(), share.device_id(), pointer(stream));
+}
+
 void deform(uintptr_t stream, const In& means, const In& tangents, const In& normals, const In& offset, const In& log_scale,
             const In& rotation, Out& means_out, Out& tangents_out, Out& normals_out) {
     const mass::ResidualData d{means.data(), tangents.data(), normals.data(), offset.data(), log_scale.data(), rotation.data()};
@@ -71,6 +102,10 @@ NB_MODULE(_kernels, m) {
     m.def("product", &product);
     m.def("ssim", &ssim, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());
     m.def("ssim_backward", &ssim_backward);
+    m.def("decoder_blocks", &mass::gpu::decoder_blocks);
+    m.def("decoder_sums", &mass::gpu::decoder_sums);
+    m.def("decode", &decode);
+    m.def("decode_backward", &decode_backward);
     m.def("deform", &deform);
     m.def("deform_backward", &deform_backward);
 #if defined(MASS_EMULATED)

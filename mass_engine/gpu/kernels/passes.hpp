@@ -4,6 +4,7 @@
 
 #include <cstdint>
 
+#include "decoder_types.hpp"
 #include "residual_types.hpp"
 
 namespace mass::gpu {
@@ -36,6 +37,29 @@ inline int ssim_blocks(int height, int width) {
 void ssim(const Pictures& p, float* sums, float* slopes, int device, void* stream);
 // d_seen [height,width,3] of scale * the sum over all blocks.
 void ssim_backward(const Pictures& p, const float* slopes, const float* scale, float* d_seen, int device, void* stream);
+
+// Where a block's sums of the decoder's gradients lie: second [H,H], its bias [H], head [H,9], its bias [9], pose [B,H].
+struct DecoderSumPlaces {
+    int second, second_bias, head, head_bias, pose;
+#if defined(__CUDACC__)
+    __device__
+#endif
+    explicit DecoderSumPlaces(int hidden)
+        : second(0), second_bias(hidden * hidden), head(second_bias + hidden), head_bias(head + hidden * kOutputs),
+          pose(head_bias + kOutputs) {}
+};
+constexpr int decoder_sums(int hidden, int batch) { return hidden * hidden + hidden + (hidden + 1) * kOutputs + batch * hidden; }
+// Fixed by the number of surfels alone, so that sums are the same on every GPU.
+inline int decoder_blocks(int count) {
+    const int chunks = (count + 31) / 32;
+    return chunks < 1 ? 1 : chunks < 512 ? chunks : 512;
+}
+
+// The layers after the hash grid; `d.head` is [H,9], its hidden width 16, 32, 48 or 64.
+void decode(const DecoderData& d, const ResidualRows& out, int device, void* stream);
+// partial [blocks,sums] is scratch.
+void decode_backward(const DecoderData& d, const ResidualRowGradients& g, float* d_share, float* partial, float* sums, int device,
+                     void* stream);
 
 // What residuals do to surfels, [rows,...] each; the gradient of the means passes unchanged.
 void deform(const ResidualData& d, float* means, float* tangents, float* normals, int rows, int device, void* stream);

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mass_engine import gpu
+from mass_engine.deform.decoder import Layers, Units, decode_reference
 from mass_engine.deform.hashgrid import HashGrid, HashGridConfig
 from mass_engine.deform.residuals import Residuals, deform_by, deform_reference
 from mass_engine.fitting import losses
@@ -132,3 +133,35 @@ def test_what_residuals_do_to_surfels_and_its_gradient(emulated: ModuleType, cou
     for mine, other in zip(found, wanted, strict=True):
         scale = float(other.abs().max())
         torch.testing.assert_close(mine.double(), other, rtol=1e-4, atol=2e-6 * scale)
+
+
+@pytest.mark.parametrize("hidden", gpu.DECODER_WIDTHS)
+@pytest.mark.parametrize(("count", "batch"), [(1, 1), (150, 2)])
+def test_the_decoder_and_its_gradient(emulated: ModuleType, hidden: int, count: int, batch: int) -> None:
+    random = torch.Generator().manual_seed(hidden + count)
+    shapes = ((count, hidden), (batch, hidden), (hidden, hidden), (hidden,), (hidden, 9), (9,))
+    given = [torch.randn(shape, generator=random) / shape[-1] ** 0.5 for shape in shapes]
+    units = Units(1e-3, 0.1)
+    upstream = [torch.randn(batch, count, *end, generator=random) for end in ((3,), (2,), (3,), ())]
+    leaves = [value.double().requires_grad_(True) for value in given]
+    exact = decode_reference(leaves[0], leaves[1], Layers(*leaves[2:]), units)
+    wanted = [exact.offset, exact.log_scale, exact.rotation, exact.mask_logit]
+    wanted += torch.autograd.grad(wanted, leaves, [value.double() for value in upstream])
+    ours = [value.clone().requires_grad_(True) for value in given]
+    found = list(gpu.decode(emulated, units, *ours))
+    found += torch.autograd.grad(found, ours, upstream)
+    for mine, other in zip(found, wanted, strict=True):
+        scale = float(other.detach().abs().max())
+        torch.testing.assert_close(mine.double(), other, rtol=1e-4, atol=1e-5 * scale)
+
+
+def test_the_decoder_sums_alike_each_time(emulated: ModuleType) -> None:
+    random = torch.Generator().manual_seed(0)
+    shapes = ((200, 32), (1, 32), (32, 32), (32,), (32, 9), (9,))
+    given = [torch.randn(shape, generator=random).requires_grad_(True) for shape in shapes]
+    runs = []
+    for _ in range(2):
+        out = gpu.decode(emulated, Units(1e-3, 0.1), *given)
+        runs.append(torch.autograd.grad(sum(value.sum() for value in out), given))
+    for first, second in zip(*runs, strict=True):
+        assert torch.equal(first, second)

@@ -115,7 +115,10 @@ def variants(scene: Scene, camera: Camera) -> tuple[dict[str, Run], int]:
 
 
 def gsplat_variants(scene: Scene, camera: Camera) -> dict[str, Run]:
-    """gsplat's 2DGS on the same surfels; nothing when it is not installed."""
+    """gsplat's 2DGS on the same surfels; nothing when it is not installed.
+
+    With every output it also takes normals from its depth map in the forward pass, which nobody asks for here.
+    """
     if importlib.util.find_spec("gsplat") is None:
         return {}
     from gsplat import rasterization_2dgs
@@ -131,8 +134,11 @@ def gsplat_variants(scene: Scene, camera: Camera) -> dict[str, Run]:
         out = rasterization_2dgs(
             *tensors, viewmats=view, Ks=K, render_mode=mode, distloss=everything, packed=False, **size
         )
-        images = [t for t in out[:-1] if isinstance(t, Tensor) and t.requires_grad]
-        return images if everything else images[:2]
+        colors, alphas, normals, _, distortion, median, _ = out
+        images = [colors, alphas, *((normals, distortion, median) if everything else ())]
+        return [
+            t for t in images if isinstance(t, Tensor) and (t.requires_grad or not torch.is_grad_enabled())
+        ]
 
     def forward(everything: bool) -> Run:
         def step() -> None:

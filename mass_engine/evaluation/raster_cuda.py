@@ -117,7 +117,7 @@ def variants(scene: Scene, camera: Camera) -> tuple[dict[str, Run], int]:
 def gsplat_variants(scene: Scene, camera: Camera) -> dict[str, Run]:
     """gsplat's 2DGS on the same surfels; nothing when it is not installed.
 
-    With every output it also takes normals from its depth map in the forward pass, which nobody asks for here.
+    With every output its forward pass also takes normals from its depth map, which nobody asks for here.
     """
     if importlib.util.find_spec("gsplat") is None:
         return {}
@@ -167,7 +167,7 @@ def copy_bandwidth() -> float:
     """Bytes a second that the GPU moves from one large array to another, read and write counted."""
     source = torch.zeros(64 << 20, device="cuda")
     target = torch.empty_like(source)
-    times = []
+    times: list[float] = []
     for _ in range(10):
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         start.record()

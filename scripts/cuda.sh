@@ -22,8 +22,9 @@ if [ -z "${CUDACXX:-}" ]; then
     say "installing ${WHEELS[*]}"
     pip install --no-deps "${WHEELS[@]}"
     home=$("$VENV/bin/python" -c 'import pathlib, sysconfig; print(pathlib.Path(sysconfig.get_path("purelib")) / "nvidia" / "cu13")')
-    # nvcc looks for its libraries in lib64, where the wheels do not put them.
+    # The names nvcc and CMake look for, which the wheels leave out.
     [ -e "$home/lib64" ] || ln -s lib "$home/lib64"
+    [ -e "$home/lib/libcudart.so" ] || ln -s libcudart.so.13 "$home/lib/libcudart.so"
     export CUDACXX=$home/bin/nvcc
 fi
 "$CUDACXX" --version | tail -2 | head -1 >&2 || stop "$CUDACXX does not run"

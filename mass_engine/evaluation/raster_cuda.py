@@ -115,7 +115,10 @@ def variants(scene: Scene, camera: Camera) -> tuple[dict[str, Run], int]:
 
 
 def gsplat_variants(scene: Scene, camera: Camera) -> dict[str, Run]:
-    """gsplat's 2DGS on the same surfels; nothing when it is not installed."""
+    """gsplat's 2DGS on the same surfels; nothing when it is not installed.
+
+    With every output its forward pass also takes normals from its depth map, which nobody asks for here.
+    """
     if importlib.util.find_spec("gsplat") is None:
         return {}
     from gsplat import rasterization_2dgs
@@ -131,8 +134,11 @@ def gsplat_variants(scene: Scene, camera: Camera) -> dict[str, Run]:
         out = rasterization_2dgs(
             *tensors, viewmats=view, Ks=K, render_mode=mode, distloss=everything, packed=False, **size
         )
-        images = [t for t in out[:-1] if isinstance(t, Tensor) and t.requires_grad]
-        return images if everything else images[:2]
+        colors, alphas, normals, _, distortion, median, _ = out
+        images = [colors, alphas, *((normals, distortion, median) if everything else ())]
+        return [
+            t for t in images if isinstance(t, Tensor) and (t.requires_grad or not torch.is_grad_enabled())
+        ]
 
     def forward(everything: bool) -> Run:
         def step() -> None:
@@ -161,7 +167,7 @@ def copy_bandwidth() -> float:
     """Bytes a second that the GPU moves from one large array to another, read and write counted."""
     source = torch.zeros(64 << 20, device="cuda")
     target = torch.empty_like(source)
-    times = []
+    times: list[float] = []
     for _ in range(10):
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         start.record()

@@ -58,8 +58,7 @@ Frame take_all(const Shape& shape, Pieces& pieces) {
         f.touched = pieces.take<uint8_t>(room);
         f.camera_partial = pieces.take<float>(size(surfel_blocks(shape.surfels)) * kCameraGradient);
     }
-    f.scratch_bytes = scratch_bytes(shape.surfels > shape.capacity ? shape.surfels : shape.capacity);
-    f.scratch = pieces.take<char>(f.scratch_bytes);
+    f.scratch = pieces.take<char>(shape.scratch_bytes);
     return f;
 }
 

@@ -19,7 +19,10 @@ struct Shape {
     int surfels, width, height;
     int capacity;  // pairs of surfel and tile there is room for
     bool extra, differentiable;
+    std::size_t scratch_bytes;  // what sorting takes: scratch_bytes(most_items(shape))
 };
+
+inline int most_items(const Shape& s) { return s.surfels > s.capacity ? s.surfels : s.capacity; }
 
 inline int tiles_of(const Shape& s) {
     return ((s.width + kTile - 1) / kTile) * ((s.height + kTile - 1) / kTile);
@@ -52,7 +55,6 @@ struct Frame {
     uint8_t* touched;
     float* camera_partial;  // [blocks of surfels, kCameraGradient]
     void* scratch;
-    std::size_t scratch_bytes;
 };
 
 // `camera` without its pose and K, which the kernels read from the device: pose [4,4], K [3,3], row major.
@@ -86,11 +88,12 @@ void blend(const Call& call, const ImageData& images, float* weights);
 void blend_backward(const Call& call, const ImageData& images, const ImageGradient& gradient);
 void project_backward(const Call& call, const ImageGradient& gradient, const SurfelGradient& out, float* d_pose, float* d_K);
 
-// Stable; `bits` low bits of the keys count. `scratch` has scratch_bytes(count) bytes or more.
+// Bytes of scratch memory the next two take for `count` items; asks the driver.
 std::size_t scratch_bytes(int count);
-void sort_by_key(const Frame& frame, const uint32_t* keys, uint32_t* keys_out, const uint32_t* values, uint32_t* values_out, int count,
-                 int bits, void* stream);
+// Stable; the `bits` low bits of the keys count.
+void sort_by_key(const Call& call, const uint32_t* keys, uint32_t* keys_out, const uint32_t* values, uint32_t* values_out, int count,
+                 int bits);
 // out[i] = the sum of in[0 .. i-1]
-void sum_before(const Frame& frame, const uint64_t* in, uint64_t* out, int count, void* stream);
+void sum_before(const Call& call, const uint64_t* in, uint64_t* out, int count);
 
 }  // namespace mass::gpu

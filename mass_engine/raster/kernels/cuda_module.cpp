@@ -37,8 +37,9 @@ class Plan {
 public:
     Plan(int surfels, int width, int height, int capacity, bool extra, bool differentiable, float near_z, float distortion_scale,
          bool cull_backfaces, int bounds, bool center_depth)
-        : shape_{surfels, width, height, capacity, extra, differentiable} {
+        : shape_{surfels, width, height, capacity, extra, differentiable, 0} {
         if (surfels < 0 || capacity < 0 || width <= 0 || height <= 0) throw std::invalid_argument("sizes are negative");
+        shape_.scratch_bytes = mass::gpu::scratch_bytes(mass::gpu::most_items(shape_));
         if (bounds < 0 || bounds > 2) throw std::invalid_argument("bounds is 0, 1 or 2");
         camera_.near_z = near_z;
         camera_.inverse_near = 1.0f / near_z;

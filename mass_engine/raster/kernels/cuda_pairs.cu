@@ -58,14 +58,14 @@ void list_pairs(const Call& call, int* counters) {
     const Frame& f = call.frame;
     const Stream stream = static_cast<Stream>(call.stream);
     const int surfels = call.shape.surfels, capacity = call.shape.capacity, tiles = tiles_of(call.shape);
-    sort_by_key(f, f.depth, f.depth_sorted, f.index, f.order, surfels, 32, stream);
+    sort_by_key(call, f.depth, f.depth_sorted, f.index, f.order, surfels, 32);
     launch(device::count_pairs, surfel_blocks(surfels + 1), kSurfelThreads, stream, f, surfels);
-    sum_before(f, f.tiles, f.tiles_before, surfels + 1, stream);
+    sum_before(call, f.tiles, f.tiles_before, surfels + 1);
     fill_bytes(f.pair_tile, 0xff, sizeof(uint32_t) * static_cast<std::size_t>(capacity), stream);
     launch(device::write_pairs, surfel_blocks(surfels + 1), kSurfelThreads, stream, f, surfels, capacity, call.camera.tiles_x, counters);
     int bits = 1;  // `tiles` and all ones differ from every tile's number in them
     while (tiles >> bits != 0) ++bits;
-    sort_by_key(f, f.pair_tile, f.pair_tile_sorted, f.pair_surfel, f.pair_surfel_sorted, capacity, bits, stream);
+    sort_by_key(call, f.pair_tile, f.pair_tile_sorted, f.pair_surfel, f.pair_surfel_sorted, capacity, bits);
     launch(device::find_tiles, surfel_blocks(tiles + 1), kSurfelThreads, stream, f, tiles, capacity);
 }
 

@@ -25,25 +25,24 @@ std::size_t scratch_bytes(int count) {
     return sort > sum ? sort : sum;
 }
 
-void sort_by_key(const Frame& frame, const uint32_t* keys, uint32_t* keys_out, const uint32_t* values, uint32_t* values_out, int count,
-                 int bits, void* stream) {
+void sort_by_key(const Call& call, const uint32_t* keys, uint32_t* keys_out, const uint32_t* values, uint32_t* values_out, int count,
+                 int bits) {
     if (count == 0) return;
-    std::size_t bytes = frame.scratch_bytes;
-    check(cub::DeviceRadixSort::SortPairs(frame.scratch, bytes, keys, keys_out, values, values_out, count, 0, bits,
-                                          static_cast<Stream>(stream)));
+    std::size_t bytes = call.shape.scratch_bytes;
+    check(cub::DeviceRadixSort::SortPairs(call.frame.scratch, bytes, keys, keys_out, values, values_out, count, 0, bits,
+                                          static_cast<Stream>(call.stream)));
 }
 
-void sum_before(const Frame& frame, const uint64_t* in, uint64_t* out, int count, void* stream) {
-    std::size_t bytes = frame.scratch_bytes;
-    check(cub::DeviceScan::ExclusiveSum(frame.scratch, bytes, in, out, count, static_cast<Stream>(stream)));
+void sum_before(const Call& call, const uint64_t* in, uint64_t* out, int count) {
+    std::size_t bytes = call.shape.scratch_bytes;
+    check(cub::DeviceScan::ExclusiveSum(call.frame.scratch, bytes, in, out, count, static_cast<Stream>(call.stream)));
 }
 
 #else
 
 std::size_t scratch_bytes(int) { return 0; }
 
-void sort_by_key(const Frame&, const uint32_t* keys, uint32_t* keys_out, const uint32_t* values, uint32_t* values_out, int count, int bits,
-                 void*) {
+void sort_by_key(const Call&, const uint32_t* keys, uint32_t* keys_out, const uint32_t* values, uint32_t* values_out, int count, int bits) {
     std::vector<int> order(static_cast<std::size_t>(count));
     std::iota(order.begin(), order.end(), 0);
     const uint32_t mask = bits == 32 ? 0xffffffffu : (1u << bits) - 1u;
@@ -54,7 +53,7 @@ void sort_by_key(const Frame&, const uint32_t* keys, uint32_t* keys_out, const u
     }
 }
 
-void sum_before(const Frame&, const uint64_t* in, uint64_t* out, int count, void*) {
+void sum_before(const Call&, const uint64_t* in, uint64_t* out, int count) {
     uint64_t sum = 0;
     for (int i = 0; i < count; ++i) {
         out[i] = sum;

@@ -13,7 +13,16 @@ from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.evaluation.raster_cuda import captured
 from mass_engine.evaluation.raster_scene import hand_camera, hand_scene
 from mass_engine.raster import Extras, RasterOptions, RenderOutput, cuda, rasterize
-from tests.engine.raster.scenes import EVERYTHING, KINDS, Surfels, camera, images, surfels, with_gradients
+from tests.engine.raster.scenes import (
+    EVERYTHING,
+    KINDS,
+    Surfels,
+    camera,
+    images,
+    render,
+    surfels,
+    with_gradients,
+)
 
 REFERENCE = replace(EVERYTHING, backend="reference")
 
@@ -27,13 +36,13 @@ def draw(
     tangents: Tensor,
     opacities: Tensor,
     colors: Tensor,
-    view: Camera,
+    camera: Camera,
     *,
     options: RasterOptions,
 ) -> RenderOutput:
     """Tensors from the CPU and back, computed on the GPU."""
-    given = (t.cuda() for t in (means, tangents, opacities, colors))
-    out = rasterize(*given, on_gpu(view), options=options)
+    scene = Surfels(means, tangents, opacities, colors).map(torch.Tensor.cuda)
+    out = rasterize(*scene.tensors(), on_gpu(camera), options=options)
     assert out.extras is not None
     extras = Extras(*(getattr(out.extras, f.name).cpu() for f in fields(Extras)))
     return RenderOutput(out.rgb.cpu(), out.alpha.cpu(), out.depth.cpu(), out.dropped, extras)
@@ -75,7 +84,7 @@ def test_the_same_bits_every_time() -> None:
     leaves = [t.cuda().requires_grad_() for t in scene.tensors()]
 
     def step() -> list[torch.Tensor]:
-        out = rasterize(*leaves, view, options=EVERYTHING)
+        out = render(Surfels(*leaves), view)
         made = list(images(out).values())
         return [*made, *torch.autograd.grad(made, leaves, [torch.ones_like(i) for i in made])]
 
@@ -94,7 +103,7 @@ def test_a_captured_step_is_the_same_step() -> None:
     kept: dict[str, list[torch.Tensor]] = {}
 
     def step() -> None:
-        out = rasterize(*leaves, view, options=options)
+        out = render(Surfels(*leaves), view, options)
         made = list(images(out).values())
         assert out.counters is not None
         gradients = torch.autograd.grad(made, leaves, [torch.ones_like(i) for i in made])

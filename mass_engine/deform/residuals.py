@@ -98,7 +98,8 @@ def deform(
         return deform_by(gpu.deform_passes(kernels), surfels, residuals)
     if surfels.means.device.type != "cpu":
         return deform_reference(surfels, residuals)
-    compiled, count = shared_kernels(instruction_set), threads or available_threads()
+    compiled: Any = shared_kernels(instruction_set)
+    count = threads or available_threads()
     passes = (
         lambda *given: compiled.deform(*given, count),
         lambda *given: compiled.deform_backward(*given, count),

@@ -8,6 +8,12 @@
 #include "decoder_outputs.hpp"
 #include "passes.hpp"
 
+#if defined(__CUDACC__)
+#define MASS_UNROLL _Pragma("unroll")
+#else
+#define MASS_UNROLL
+#endif
+
 namespace mass::device {
 
 template <int H>
@@ -30,14 +36,14 @@ MASS_DEVICE F first_layer(const DecoderData& d, int64_t n, int b, int i) {
 
 template <int H>
 MASS_DEVICE void second_layer(const DecoderData& d, const Weights<H>& w, int64_t n, int b, F (&out)[H]) {
-#pragma unroll
+    MASS_UNROLL
     for (int j = 0; j < H; ++j) out[j] = w.second_bias[j];
     for (int i = 0; i < H; ++i) {
         const F h = first_layer(d, n, b, i);
-#pragma unroll
+        MASS_UNROLL
         for (int j = 0; j < H; ++j) out[j] = fma(h, w.second[i][j], out[j]);
     }
-#pragma unroll
+    MASS_UNROLL
     for (int j = 0; j < H; ++j) out[j] = relu(out[j]);
 }
 
@@ -52,10 +58,10 @@ MASS_KERNEL(kDecodeThreads) decode_rows(DecoderData d, ResidualRows out) {
     for (int b = 0; b < d.batch; ++b) {
         F refined[H], x[kOutputs];
         second_layer<H>(d, w, n, b, refined);
-#pragma unroll
+        MASS_UNROLL
         for (int k = 0; k < kOutputs; ++k) {
             x[k] = w.head_bias[k];
-#pragma unroll
+            MASS_UNROLL
             for (int j = 0; j < H; ++j) x[k] = fma(refined[j], w.head[j][k], x[k]);
         }
         const Outputs o = residuals_of(d.offset_unit, d.rotation_unit, [&](int k) { return x[k]; });
@@ -68,7 +74,7 @@ MASS_KERNEL(kDecodeThreads) decode_rows(DecoderData d, ResidualRows out) {
 
 // Surfels whose activations a block holds at a time.
 template <int H>
-inline constexpr int kRowsHeld = H <= 32 ? 64 : 32;
+inline constexpr int kRowsHeld = H <= 32 ? gpu::kMostRowsHeld : 32;
 
 // sum[e] (+)= the sum over rows of a[row][e / columns] * c[row][e % columns], an entry a thread.
 template <int rows, int A, int C>
@@ -114,21 +120,21 @@ MASS_KERNEL(kRowsHeld<H>) decode_rows_backward(DecoderData d, ResidualRowGradien
                 second_layer<H>(d, w, n, b, refined);
             } else {
                 for (int k = 0; k < kOutputs; ++k) x[k] = 0.0f;
-#pragma unroll
+                MASS_UNROLL
                 for (int j = 0; j < H; ++j) refined[j] = 0.0f;
             }
             for (int k = 0; k < kOutputs; ++k) d_out[t][k] = x[k];
-#pragma unroll
+            MASS_UNROLL
             for (int j = 0; j < H; ++j) active[t][j] = refined[j];
             sync_block();
             sum_products<kRows, H, kOutputs>(active, d_out, start, sums + at.head);
             sum_columns<kRows, kOutputs>(d_out, kOutputs, start, sums + at.head_bias);
             sync_block();
             // `refined` becomes its own gradient before the rectifier.
-#pragma unroll
+            MASS_UNROLL
             for (int j = 0; j < H; ++j) {
                 F sum = 0.0f;
-#pragma unroll
+                MASS_UNROLL
                 for (int k = 0; k < kOutputs; ++k) sum = fma(x[k], w.head[j][k], sum);
                 refined[j] = keep(lt(0.0f, refined[j]), sum);
                 slopes[t][j] = refined[j];
@@ -140,7 +146,7 @@ MASS_KERNEL(kRowsHeld<H>) decode_rows_backward(DecoderData d, ResidualRowGradien
             sync_block();
             for (int i = 0; i < H; ++i) {
                 F sum = 0.0f;
-#pragma unroll
+                MASS_UNROLL
                 for (int j = 0; j < H; ++j) sum = fma(w.second[i][j], refined[j], sum);
                 sum = keep(lt(0.0f, active[t][i]), sum);
                 slopes[t][i] = sum;

@@ -49,9 +49,10 @@ struct DecoderSumPlaces {
           pose(head_bias + kOutputs) {}
 };
 constexpr int decoder_sums(int hidden, int batch) { return hidden * hidden + hidden + (hidden + 1) * kOutputs + batch * hidden; }
-// Fixed by the number of surfels alone, so that sums are the same on every GPU.
+// Fixed by the number of surfels alone, so that sums are the same on every GPU; each has some.
+inline constexpr int kMostRowsHeld = 64;
 inline int decoder_blocks(int count) {
-    const int chunks = (count + 31) / 32;
+    const int chunks = (count + kMostRowsHeld - 1) / kMostRowsHeld;
     return chunks < 1 ? 1 : chunks < 512 ? chunks : 512;
 }
 

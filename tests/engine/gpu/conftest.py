@@ -8,6 +8,13 @@ from types import ModuleType
 import pytest
 
 from tests.emulation import ROOT, build
+from tests.gpu import gpu_problem, nvcc
+
+# A line at the end of the run says what was left out.
+collect_ignore = [
+    *(["test_gpu.py"] if gpu_problem() else []),
+    *([] if nvcc() else ["test_cuda_build.py"]),
+]
 
 KERNELS = ROOT / "mass_engine" / "gpu" / "kernels"
 OTHERS = [ROOT / "mass_engine" / part / "kernels" for part in ("raster", "deform")]

@@ -122,7 +122,7 @@ def test_what_residuals_do_to_surfels_and_its_gradient(emulated: ModuleType, cou
         way: Callable[[AttachedSurfels, Residuals], AttachedSurfels], *values: Tensor
     ) -> list[Tensor]:
         leaves = [value.clone().requires_grad_(True) for value in values]
-        out = way(AttachedSurfels(*leaves[:3]), Residuals(*leaves[3:], normal()))
+        out = way(AttachedSurfels(*leaves[:3]), Residuals(leaves[3], leaves[4], leaves[5], normal()))
         images = (out.means, out.tangents, out.normals)
         upstream = [weight.to(values[0]) for weight in weights]
         return [*(i.detach() for i in images), *torch.autograd.grad(images, leaves, upstream)]
@@ -162,6 +162,6 @@ def test_the_decoder_sums_alike_each_time(emulated: ModuleType) -> None:
     runs = []
     for _ in range(2):
         out = gpu.decode(emulated, Units(1e-3, 0.1), *given)
-        runs.append(torch.autograd.grad(sum(value.sum() for value in out), given))
+        runs.append(torch.autograd.grad([value.sum() for value in out], given))
     for first, second in zip(*runs, strict=True):
         assert torch.equal(first, second)

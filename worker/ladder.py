@@ -17,6 +17,8 @@ from service.jobs.model import JobKind
 #: The engine's word and exit code for it.
 OUT_OF_MEMORY = "device.out_of_memory"
 EXIT_OUT_OF_MEMORY = 5
+#: Its word for a GPU that is asked for and not there.
+DEVICE_UNAVAILABLE = "device.unavailable"
 #: How often a job is tried again in one attempt.
 MOST_RETRIES = 2
 

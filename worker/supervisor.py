@@ -24,7 +24,7 @@ from service.queue import JobQueue
 from service.settings import Settings
 from service.storage import Storage, missing_outputs
 from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, animate_command, fit_command
-from worker.ladder import EXIT_OUT_OF_MEMORY, OUT_OF_MEMORY, Setting
+from worker.ladder import DEVICE_UNAVAILABLE, EXIT_OUT_OF_MEMORY, OUT_OF_MEMORY, Setting
 from worker.run_directory import CHECKPOINT, drop_checkpoint, has_checkpoint, prepare
 from worker.sandbox import Sandbox
 
@@ -326,9 +326,9 @@ class Supervisor:
         elif code == _EXIT_BAD_ARGUMENTS:
             log.error("job %s: the engine refused its arguments: %s", claim.job_id, engine.tail)
             message = said.message if said else "The engine does not accept these options."
-            return self._fail(
-                claim, "options.invalid", message, (said and said.advice) or "Submit with other options."
-            )
+            # That this machine lacks a GPU is not the owner's doing.
+            word = DEVICE_UNAVAILABLE if said and said.code == DEVICE_UNAVAILABLE else "options.invalid"
+            return self._fail(claim, word, message, (said and said.advice) or "Submit with other options.")
         elif code == _EXIT_BAD_INPUT and said is not None and said.code:
             outcome = self._fail(claim, said.code, said.message, said.advice)
             if outcome is Outcome.FAILED:

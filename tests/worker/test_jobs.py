@@ -77,6 +77,13 @@ def test_arguments_the_engine_refuses_are_not_tried_again(running: Bench) -> Non
     assert len(running.starts(job_id)) == 1
 
 
+def test_a_gpu_that_is_not_there_is_named_and_not_looked_for_again(running: Bench) -> None:
+    job_id = running.submit("no_device", options={"device": "cuda"})
+    job = running.until(job_id, "failed")
+    assert (job.error_code, job.error_message) == ("device.unavailable", "There is no GPU.")
+    assert len(running.starts(job_id)) == 1
+
+
 def test_an_unknown_option_in_the_row_never_reaches_the_engine(running: Bench) -> None:
     job_id = running.job(options={"out": "/etc"})
     running.publish(job_id)

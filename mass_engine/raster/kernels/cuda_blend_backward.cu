@@ -82,7 +82,7 @@ differentiate_tiles(CameraData camera, ProjectedData in, PairData pairs, ImageDa
     for (int after = last; after > 0; after -= kBackBatch) {  // ranks first .. after - 1
         const int first = after > kBackBatch ? after - kBackBatch : 0, count = after - first;
         const uint32_t* ids = pairs.surfel + begin + first;
-        sync_block();  // the batch before has been added up
+        // None still reads the surfels of the batch before: its sums were met by all. Its sums are read until the next barrier.
         fetch(in.splats, ids, count, splats);
         if constexpr (kExtra) fetch(in.normals, ids, count, normals);
         sync_block();

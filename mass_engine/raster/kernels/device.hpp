@@ -90,7 +90,8 @@ private:
 
 // Why no kernel can run here; empty when one can.
 inline std::string device_problem() {
-    int count = 0;
+    int driver = 0, count = 0;
+    if (cudaDriverGetVersion(&driver) != cudaSuccess || driver == 0) return "no NVIDIA driver is installed";
     const cudaError_t error = cudaGetDeviceCount(&count);
     if (error != cudaSuccess) return cudaGetErrorString(error);
     return count > 0 ? "" : "no CUDA-capable device is detected";

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from mass_engine import raster
 from mass_engine.cli import main
 from mass_engine.errors import EngineError
 from mass_engine.evaluation import bench_raster, pareto, stability
@@ -136,6 +137,8 @@ def test_the_best_of_every_clip(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_a_benchmark_on_a_gpu_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "mass_engine.raster._cuda_kernels", None)  # as if it had not been built
+    # As if it had not been built.
+    monkeypatch.setitem(sys.modules, "mass_engine.raster._cuda_kernels", None)
+    monkeypatch.delattr(raster, "_cuda_kernels", raising=False)
     with pytest.raises(EngineError, match=r"device\.unavailable.*make cuda"):
         bench_raster.run(["--device", "cuda"])

@@ -27,6 +27,7 @@ from tests.engine.raster.scenes import (
     surfels,
     with_gradients,
 )
+from tests.gpu import gpu_problem
 
 REFERENCE = replace(EVERYTHING, backend="reference")
 COLOR = replace(EVERYTHING, outputs="color")
@@ -214,3 +215,11 @@ def test_gradients_of_one_image_alone(draw: Draw) -> None:
             results.append([torch.zeros_like(x) if x.grad is None else x.grad for x in leaves])
         for got, expected in zip(*results, strict=True):
             assert float((got - expected).norm()) <= 1e-3 * float(expected.norm()) + 1e-12, name
+
+
+def test_no_gpu_is_a_clear_error() -> None:
+    if gpu_problem():
+        with pytest.raises(EngineError, match=r"device\.unavailable"):
+            cuda.import_kernels()
+    else:
+        assert cuda.import_kernels().problem() == ""

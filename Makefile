@@ -5,12 +5,12 @@ BIN := $(VENV)/bin
 VIDEO ?=
 DEMO_OUT ?= demo-output
 
-.PHONY: help setup demo serve test lint check-types bench openapi clean
+.PHONY: help setup demo serve test cuda lint check-types bench openapi clean
 
 help:
 	@echo "make demo [VIDEO=path.mp4]  run one job through the service, save renders and assets to $(DEMO_OUT)/"
 	@echo "make test                   run all checks and tests"
-	@echo "make setup | serve | bench | lint | openapi | clean"
+	@echo "make setup | serve | bench | lint | openapi | cuda | clean"
 
 setup:
 	@scripts/setup.sh
@@ -20,6 +20,9 @@ demo: setup
 
 serve: setup
 	@$(BIN)/mass serve
+
+cuda: setup  # the GPU kernels, by your nvcc (CUDACXX) or one installed into $(VENV)
+	@scripts/cuda.sh
 
 lint: setup
 	$(BIN)/ruff format --check .

@@ -117,6 +117,10 @@ class Avatar:
 
     @cached_property
     def _compiled(self) -> CompiledSurfels:
+        return self.posable().compiled()
+
+    def posable(self) -> PosableSurfels:
+        """The surfels ready for posing, shared."""
         look, skin = self.appearance, self.skin
         return PosableSurfels(
             skin.binding,
@@ -127,7 +131,7 @@ class Avatar:
             look.light,
             None if skin.deformation is None else skin.deformation.freeze(),
             skin.detached_from,
-        ).compiled()
+        )
 
     def _shaded(self, pose: HandPose, hand: PosedHand, camera: Camera) -> ShadedSurfels:
         """The surfels in one pose (a batch of one, and the ``hand`` in it) as ``camera`` sees them."""
@@ -184,13 +188,25 @@ class Avatar:
         channel: str = "rgb",
     ) -> ChannelImage:
         """One channel of a pose seen by a camera. Raises BadArgumentError for a bad specification."""
+        wanted = parse_channel(channel)
+        pose, hand, camera = self._viewed(pose_spec, camera_spec, width, height)
+        return self._image(pose, hand, camera, wanted)
+
+    def resolve_view(
+        self, pose_spec: str, camera_spec: str, width: int, height: int
+    ) -> tuple[HandPose, Camera]:
+        """A placed pose (batch of one) and the camera that sees it. Raises BadArgumentError."""
+        pose, _, camera = self._viewed(pose_spec, camera_spec, width, height)
+        return pose, camera
+
+    def _viewed(
+        self, pose_spec: str, camera_spec: str, width: int, height: int
+    ) -> tuple[HandPose, PosedHand, Camera]:
         if not (1 <= width <= 16384 and 1 <= height <= 16384):
             raise BadArgumentError("size.invalid", f"{width}x{height} is not a picture.", "Use 1 to 16384.")
-        wanted = parse_channel(channel)
         pose, hand = self._placed(pose_spec)
         center, radius = _sphere(hand.vertices[0])
-        camera = parse_camera(camera_spec, self.camera, width, height, center, radius)
-        return self._image(pose, hand, camera, wanted)
+        return pose, hand, parse_camera(camera_spec, self.camera, width, height, center, radius)
 
     def render(
         self,

@@ -36,6 +36,10 @@ class Camera:
         p = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         return p[..., :2] / p[..., 2:] @ self.K[:2, :2].T + self.K[:2, 2]
 
+    def to(self, device: torch.device | str) -> Camera:
+        """The same camera elsewhere."""
+        return replace(self, K=self.K.to(device), world_to_camera=self.world_to_camera.to(device))
+
     def crop(self, x: int, y: int, width: int, height: int) -> Camera:
         """The camera of the image window whose top-left pixel is (x, y)."""
         K = self.K.clone()

@@ -139,7 +139,7 @@ def _visible_centers(out: RenderOutput, means: Tensor, camera: Camera) -> Tensor
     means = means[out.weight_sum > 0]
     z = means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     centers = torch.cat([camera.project(means), z[:, None]], -1)
-    size = torch.tensor([camera.width, camera.height])
+    size = torch.tensor([camera.width, camera.height], device=means.device)
     centers = centers[((centers[:, :2] >= 0) & (centers[:, :2] < size)).all(-1)]
     column, row = centers[:, :2].long().unbind(-1)
     surface = out.depth[row, column]

@@ -1,6 +1,7 @@
 """The command line.
 
-Exit codes: 0 done, 2 bad arguments, 3 unusable input, 4 internal failure, 130 interrupted.
+Exit codes: 0 done, 2 bad arguments, 3 unusable input, 4 internal failure, 5 a device's memory did not suffice
+(the same at a smaller setting may do), 130 interrupted.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from importlib import import_module
 from pathlib import Path
 from types import FrameType
 
-from mass_engine.errors import BadArgumentError, EngineError
+from mass_engine.device import DEVICES, memory_error
+from mass_engine.errors import OUT_OF_MEMORY, BadArgumentError, EngineError
 from mass_engine.evaluation.arguments import add_eval_arguments
 from mass_engine.fitting.components import BINDINGS, Components
-from mass_engine.options import DEVICES, PRESETS, SEGMENTERS, SIDES, FitOptions
+from mass_engine.options import PRECISIONS, PRESETS, SEGMENTERS, SIDES, FitOptions
 from mass_engine.progress import FIT_STAGES, Progress
 
 #: Parts of the method that ``--no-...`` switches off.
@@ -41,6 +43,9 @@ BENCHMARKS = {
     "needed": "needed",
     "clips": "by_clip",
 }
+
+#: The exit code of ``device.out_of_memory``.
+EXIT_OUT_OF_MEMORY = 5
 
 Command = Callable[[argparse.Namespace], None]
 
@@ -89,6 +94,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     fit.add_argument("--seed", type=int, default=0)
     fit.add_argument("--device", choices=DEVICES, default="auto")
+    fit.add_argument(
+        "--precision", choices=PRECISIONS, default=FitOptions.precision, help="of matrix products on a GPU"
+    )
     fit.add_argument("--fov", type=float, metavar="DEGREES", help="field of view of the longer image side")
     fit.add_argument("--max-frames", type=int, default=FitOptions.max_frames, metavar="N")
     fit.add_argument("--resume", action="store_true", help="go on with the killed fit in RUN")
@@ -124,6 +132,7 @@ def build_parser() -> argparse.ArgumentParser:
     render.add_argument(
         "--channel", default="rgb", metavar="rgb|alpha|depth|normal|distortion|surfels", help="what to show"
     )
+    render.add_argument("--device", choices=DEVICES, default="cpu", help="where it is rendered")
     render.add_argument(
         "--out",
         type=Path,
@@ -143,6 +152,7 @@ def build_parser() -> argparse.ArgumentParser:
         'format ("mp4", "webp"); every one may be left out',
     )
     animate.add_argument("--out", type=Path, required=True, help="directory for motion.mp4 or motion.webp")
+    animate.add_argument("--device", choices=DEVICES, default="auto", help="where it is rendered")
     animate.add_argument("--json", action="store_true", help="progress as JSON lines on standard output")
     animate.set_defaults(run=_animate)
 
@@ -192,11 +202,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.run(arguments)
     except EngineError as error:
         _report_error(error, json_lines)
+        if error.code == OUT_OF_MEMORY:
+            return EXIT_OUT_OF_MEMORY
         return 2 if isinstance(error, BadArgumentError) else 3
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
     except Exception as error:
+        full = memory_error(error)
+        if full is not None:
+            _report_error(full, json_lines)
+            return EXIT_OUT_OF_MEMORY
         traceback.print_exc()
         internal = EngineError(
             "engine.internal",
@@ -234,6 +250,7 @@ def _fit(arguments: argparse.Namespace) -> None:
         holdout=arguments.holdout,
         seed=arguments.seed,
         device=arguments.device,
+        precision=arguments.precision,
         fov=arguments.fov,
         max_frames=arguments.max_frames,
         resume=arguments.resume,
@@ -286,7 +303,9 @@ def _render(arguments: argparse.Namespace) -> None:
             "render.what", "Say what to render.", "Give either --frames or --pose, not both."
         )
     if arguments.frames is not None:
-        count = render_frames(arguments.run_dir, arguments.frames, arguments.out, arguments.channel)
+        count = render_frames(
+            arguments.run_dir, arguments.frames, arguments.out, arguments.channel, arguments.device
+        )
         print(f"wrote {count} frames to {arguments.out}")
     else:
         render_to_file(
@@ -296,6 +315,7 @@ def _render(arguments: argparse.Namespace) -> None:
             arguments.size,
             arguments.out,
             arguments.channel,
+            arguments.device,
         )
         print(f"wrote {arguments.out}")
 
@@ -307,7 +327,8 @@ def _animate(arguments: argparse.Namespace) -> None:
         if arguments.json:
             _emit(type="progress", stage="render", fraction=round(fraction, 4), time_left=None, message="")
 
-    file = animate(arguments.run_dir, read_motion(arguments.motion), arguments.out, report)
+    motion = read_motion(arguments.motion)
+    file = animate(arguments.run_dir, motion, arguments.out, report, arguments.device)
     if arguments.json:
         _emit(type="done", report=str(file))
     else:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+#: The code of a failure that a smaller setting may avoid: a device's memory did not suffice.
+OUT_OF_MEMORY = "device.out_of_memory"
+
 
 class EngineError(Exception):
     """The input cannot be used (exit code 3).

@@ -16,8 +16,10 @@ import torch
 from numpy.typing import NDArray
 
 from mass_engine.avatar import Avatar, row_pose
+from mass_engine.device import choose_device
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.hand.pose import HandPose
+from mass_engine.many_poses import draw_images
 from mass_engine.tracking.alignment import interpolate_pose
 from mass_engine.video.writer import write_video
 from mass_engine.viewpoint import parse_camera
@@ -96,32 +98,53 @@ def frame_count(motion: Motion) -> int:
     return gaps * (motion.between + 1) + (0 if motion.loop and gaps else 1)
 
 
-def pictures(avatar: Avatar, motion: Motion) -> Iterator[NDArray[np.uint8]]:
-    """Straight-alpha RGBA uint8 [H,W,4], one a frame. One camera distance holds for all of them."""
+def pictures(
+    avatar: Avatar, motion: Motion, device: torch.device | None = None
+) -> Iterator[NDArray[np.uint8]]:
+    """Straight-alpha RGBA uint8 [H,W,4], one a frame. One camera distance holds for all of them.
+
+    ``device``: where they are rendered (None: the CPU).
+    """
     poses = [avatar.resolve_pose(spec) for spec in motion.poses]
     count = frame_count(motion)
     rows = poses[0] if motion.kind == "turntable" else _between(poses, motion, count)
     center, radius = _bounds(avatar, poses)
-    for number in range(count):
-        turn = 360.0 * number / count if motion.kind == "turntable" else 0.0
-        spec = _turned(motion.camera, turn)
-        camera = parse_camera(spec, avatar.camera, motion.width, motion.height, center, radius)
-        pose = rows if motion.kind == "turntable" else row_pose(rows, number)
-        yield avatar.image(pose, camera).picture()
+    turning = motion.kind == "turntable"
+    cameras = [
+        parse_camera(
+            _turned(motion.camera, 360.0 * number / count if turning else 0.0),
+            avatar.camera,
+            motion.width,
+            motion.height,
+            center,
+            radius,
+        )
+        for number in range(count)
+    ]
+    each = [rows if turning else row_pose(rows, number) for number in range(count)]
+    for image in draw_images(avatar, each, cameras, "rgb", device or torch.device("cpu")):
+        yield image.picture()
 
 
-def animate(source: Path, motion: Motion, out: Path, report: Callable[[float], None] | None = None) -> Path:
+def animate(
+    source: Path,
+    motion: Motion,
+    out: Path,
+    report: Callable[[float], None] | None = None,
+    device: str = "cpu",
+) -> Path:
     """Write ``out/motion.mp4`` or ``out/motion.webp`` of the avatar at ``source``; returns the file.
 
     ``report`` gets the fraction done. Raises EngineError and BadArgumentError.
     """
+    on = choose_device(device)
     avatar = Avatar.load(source)
     target = out / f"motion.{motion.format}"
     out.mkdir(parents=True, exist_ok=True)
     total = frame_count(motion)
 
     def counted() -> Iterator[NDArray[np.uint8]]:
-        for number, picture in enumerate(pictures(avatar, motion)):
+        for number, picture in enumerate(pictures(avatar, motion, on)):
             yield picture
             if report is not None:
                 report((number + 1) / total)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import get_args
 
+from mass_engine.device import DEVICES, Precision, choose_device
 from mass_engine.errors import BadArgumentError
 from mass_engine.fitting.components import Components
 from mass_engine.progress import FIT_STAGES
@@ -13,8 +15,8 @@ from mass_engine.tracks_spec import parse_tracks
 
 PRESETS = ("draft", "auto", "full")
 SIDES = ("auto", "left", "right", "both")
-DEVICES = ("auto", "cpu", "cuda")
 SEGMENTERS = ("colors", "sam-hq")
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class FitOptions:
     ``max_frames`` bounds the frames the fit sees; held-out frames do not count, of which at most 160 (or
     ``max_frames``, if that is more) are kept, evenly spread. A video of more than ``max_seconds`` is refused.
 
+    ``precision`` of the deformation's matrix products on a GPU; a CPU's are always float32.
+
     ``resume``: go on after the last step that a killed fit of the same clip and options left in the run's
     directory; of that only what comes before ``from_stage`` (one of the report's stages). ``components``:
     parts of the method to switch off.
@@ -49,6 +53,7 @@ class FitOptions:
     holdout: int = 0
     seed: int = 0
     device: str = "auto"
+    precision: Precision = "float32"
     fov: float | None = None
     max_frames: int = 160
     resume: bool = False
@@ -61,6 +66,12 @@ class FitOptions:
             (self.preset in PRESETS, "preset", self.preset, f"Use one of {', '.join(PRESETS)}."),
             (self.side in SIDES, "side", self.side, f"Use one of {', '.join(SIDES)}."),
             (self.device in DEVICES, "device", self.device, f"Use one of {', '.join(DEVICES)}."),
+            (
+                self.precision in PRECISIONS,
+                "precision",
+                self.precision,
+                f"Use one of {', '.join(PRECISIONS)}.",
+            ),
             (
                 self.segmenter in SEGMENTERS,
                 "segmenter",
@@ -94,9 +105,7 @@ class FitOptions:
             if not good:
                 raise BadArgumentError("options.invalid", f"{name} cannot be {value!r}.", advice)
         if self.device == "cuda":
-            raise BadArgumentError(
-                "device.unavailable", "There are no GPU kernels in this build.", "Use --device cpu or auto."
-            )
+            choose_device(self.device)
         parse_template(self.template)
         if self.tracks is not None:
             parse_tracks(str(self.tracks))

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from mass_engine.avatar import Avatar, row_pose
+from mass_engine.device import choose_device, device_report
 from mass_engine.errors import BadArgumentError
 from mass_engine.evaluation.scores import mean_scores, score_view
 from mass_engine.export.ply import write_ply
@@ -155,6 +156,7 @@ def _fit_hand(
     checkpoints: Path | None,
 ) -> FitOutcome:
     checkpoint = None if checkpoints is None else _checkpoint(checkpoints, hand.side, options)
+    device = choose_device(options.device)
     clip = prepare_hand(video, found, hand, options, meter)
     meter.update("convert", 0.0)
     result = fit_hand(
@@ -168,6 +170,8 @@ def _fit_hand(
         options.components,
         checkpoint,
         show,
+        device,
+        options.precision,
     )
     found_out = result.state.notes
     if found_out.get("undone_steps"):
@@ -214,7 +218,7 @@ def _fit_hand(
         fit={**found_out, "steps": result.state.steps},
         seed=options.seed,
         versions=versions(),
-        machine=machine(),
+        machine={**machine(), **device_report(device)},
         warnings=list(notes.warnings),
     )
     return FitOutcome(result.avatar, summary, tracks, clip)

@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 
 from mass_engine.avatar import Avatar
 from mass_engine.channels import parse_channel
+from mass_engine.device import choose_device
 from mass_engine.errors import BadArgumentError
+from mass_engine.many_poses import draw_images
 
 #: The suffix of a file of numbers: one NumPy array, for any program that reads arrays.
 _NUMBERS = ".npy"
 
 
-def render_frames(run: Path, frames: str, out: Path, channel: str = "rgb") -> int:
+def render_frames(run: Path, frames: str, out: Path, channel: str = "rgb", device: str = "cpu") -> int:
     """Write OUT/%06d.png of ``all``, ``holdout`` or a list of frame indices; returns how many.
 
     Straight-alpha RGBA at the video's upright size through the fitted camera; each picture's ``channel`` has
@@ -43,13 +45,16 @@ def render_frames(run: Path, frames: str, out: Path, channel: str = "rgb") -> in
             )
         indices = [int(number) for number in frames.split(",")]
     out.mkdir(parents=True, exist_ok=True)
-    for index in indices:
-        image = avatar.image(avatar.frames.pose_of(index), avatar.camera, wanted)
+    poses = [avatar.frames.pose_of(index) for index in indices]
+    images = draw_images(avatar, poses, [avatar.camera] * len(poses), wanted, choose_device(device))
+    for index, image in zip(indices, images, strict=True):
         _write(image.picture(), out / f"{index:06d}.png")
     return len(indices)
 
 
-def render_to_file(run: Path, pose: str, camera: str, size: str, out: Path, channel: str = "rgb") -> None:
+def render_to_file(
+    run: Path, pose: str, camera: str, size: str, out: Path, channel: str = "rgb", device: str = "cpu"
+) -> None:
     """Render one pose to an image file (png, jpg, webp), or its channel's numbers to a ``.npy`` file.
 
     ``camera`` may name a JSON file.
@@ -68,7 +73,13 @@ def render_to_file(run: Path, pose: str, camera: str, size: str, out: Path, chan
                 "Use source, orbit:YAW,PITCH or a JSON file.",
             ) from error
     parse_channel(channel)  # a wrong word is told before the avatar is read
-    image = Avatar.load(run).view(pose, camera, width, height, channel)
+    on = choose_device(device)
+    avatar = Avatar.load(run)
+    if on.type == "cpu":
+        image = avatar.view(pose, camera, width, height, channel)
+    else:
+        posed, seen = avatar.resolve_view(pose, camera, width, height)
+        (image,) = draw_images(avatar, [posed], [seen], parse_channel(channel), on)
     if out.suffix == _NUMBERS:
         _write_numbers(image.numbers(), out)
     else:

@@ -6,8 +6,14 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.gpu import left_out
 from tests.postgres import PostgresServer
 from tests.s3 import S3Server, s3_server
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    for line in left_out():
+        terminalreporter.write_line(line)
 
 
 @pytest.fixture(scope="session")

@@ -89,21 +89,28 @@ def fit_command(
 
 
 def animate_command(
-    engine: Sequence[str], avatar: Path, run: Path, motion: Mapping[str, object]
+    engine: Sequence[str], avatar: Path, run: Path, motion: Mapping[str, object], device: str | None = None
 ) -> list[str]:
-    """The command that renders a motion of ``avatar`` into the directory ``run``."""
+    """The command that renders a motion of ``avatar`` into the directory ``run``; ``device``: the engine's
+    choice if there is none."""
     spec = run / "motion.json"
     spec.write_text(json.dumps(motion))
-    return [*engine, "animate", str(avatar), "--motion", str(spec), "--out", str(run), "--json"]
+    words = [*engine, "animate", str(avatar), "--motion", str(spec), "--out", str(run), "--json"]
+    return words if device is None else [*words, f"--device={device}"]
 
 
 class EngineProcess:
-    """One run. Start it from the thread that stays until it ends; always call :meth:`stop` at the end."""
+    """One run. Start it from the thread that stays until it ends; always call :meth:`stop` at the end.
 
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
+    ``warnings`` begin with those given, of runs before it.
+    """
+
+    def __init__(
+        self, command: Sequence[str], environment: Mapping[str, str], warnings: Sequence[dict[str, str]] = ()
+    ) -> None:
         self.progress: EngineProgress | None = None
         self.failure: EngineFailure | None = None
-        self.warnings: list[dict[str, str]] = []
+        self.warnings = [*warnings]
         self._tail: deque[str] = deque(maxlen=_TAIL_LINES)
         self._said: deque[str] = deque(maxlen=_UNREAD_LINES)
         self._closed = threading.Event()

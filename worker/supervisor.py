@@ -25,6 +25,7 @@ from service.queue import JobQueue
 from service.settings import Settings
 from service.storage import Storage, missing_outputs
 from worker.engine import EngineProcess, EngineProgress, UnknownOptionError, animate_command, fit_command
+from worker.ladder import DEVICE_UNAVAILABLE, EXIT_OUT_OF_MEMORY, OUT_OF_MEMORY, Setting
 from worker.run_directory import CHECKPOINT, drop_checkpoint, has_checkpoint, prepare
 from worker.sandbox import Sandbox
 
@@ -179,59 +180,91 @@ class Supervisor:
     def _work(self, claim: Claim, lease: Lease) -> Outcome:
         run, resumed = prepare(self._storage, claim)
         video = self._storage.fetch_source(claim.video, run)
-        try:
-            if claim.kind == JobKind.RENDER:
-                command = animate_command(self._settings.engine, video, run, claim.options)
-            else:
-                command = fit_command(
-                    self._settings.engine,
-                    video,
-                    run,
-                    claim.options,
-                    resume=resumed,
-                    from_stage=claim.from_stage,
-                    max_seconds=self._settings.max_video_seconds,
-                )
-        except UnknownOptionError as error:
-            return self._fail(claim, "options.invalid", f"The job has an {error}.", "Submit it without.")
+        deadline = self._clock() + self._settings.job_timeout
+        setting = Setting(claim.options)
+        warnings: list[dict[str, str]] = []
+        while True:
+            try:
+                command = self._command(claim, setting, video, run, resumed)
+            except UnknownOptionError as error:
+                return self._fail(claim, "options.invalid", f"The job has an {error}.", "Submit it without.")
+            engine, stop, code = self._run_engine(claim, lease, command, video, run, deadline, warnings)
+            match stop:
+                case _Stop.LOST:
+                    return Outcome.LOST
+                case _Stop.CANCEL:
+                    return self._cancelled(claim)
+                case _Stop.SHUTDOWN:
+                    return self._release(claim, refund=True)
+                case _Stop.TIMEOUT:
+                    return self._fail(
+                        claim,
+                        "engine.timeout",
+                        f"The reconstruction did not finish within {self._settings.job_timeout:g} s.",
+                        "Submit a shorter clip, or a lower preset.",
+                    )
+            if code == EXIT_OUT_OF_MEMORY and engine.failure and engine.failure.code == OUT_OF_MEMORY:
+                smaller = setting.smaller(claim.kind)
+                if smaller is None:
+                    return self._out_of_memory(claim, setting, run)
+                setting, resumed = smaller, has_checkpoint(run)
+                warnings = [*engine.warnings, setting.warning()]
+                self._tell(claim, [f"warning {w['code']}: {w['message']}" for w in warnings[-1:]], warnings)
+                continue
+            if resumed and (code != 0 or missing_outputs(run, claim.kind)):
+                # It may be the checkpoint that breaks the engine: the next attempt begins anew.
+                drop_checkpoint(run)
+            outcome = self._conclude(claim, lease, engine, code, run)
+            if outcome is Outcome.FAILED:
+                drop_checkpoint(run)
+            return outcome
+
+    def _command(self, claim: Claim, setting: Setting, video: Path, run: Path, resumed: bool) -> list[str]:
+        """What to start. Raises UnknownOptionError."""
+        engine = self._settings.engine
+        if claim.kind == JobKind.RENDER:
+            return animate_command(engine, video, run, setting.options, device=setting.device)
+        return fit_command(
+            engine,
+            video,
+            run,
+            setting.options,
+            resume=resumed,
+            # At a smaller setting what lies there is this attempt's own.
+            from_stage=None if setting.changed else claim.from_stage,
+            max_seconds=self._settings.max_video_seconds,
+        )
+
+    def _run_engine(
+        self,
+        claim: Claim,
+        lease: Lease,
+        command: list[str],
+        video: Path,
+        run: Path,
+        deadline: float,
+        warnings: list[dict[str, str]],
+    ) -> tuple[EngineProcess, _Stop, int]:
+        """Start it, watch it, end it: afterwards no process of it is left, nor anything it had on a device.
+
+        ``warnings``: those the job has already.
+        """
         self._sandbox.open(run, video)
         environment = self._sandbox.environment(run)
         if claim.traceparent is not None:
             environment["TRACEPARENT"] = claim.traceparent
-        engine = EngineProcess(self._sandbox.command(command, run, video), environment)
+        engine = EngineProcess(self._sandbox.command(command, run, video), environment, warnings)
         grace = 0.0
         try:
-            stop = self._watch(claim, lease, engine)
+            stop = self._watch(claim, lease, engine, deadline)
             grace = {_Stop.CANCEL: _CANCEL_GRACE, _Stop.SHUTDOWN: _SHUTDOWN_GRACE}.get(stop, 0.0)
         finally:
             code = engine.stop(grace)
             self._sandbox.close(run)
-            self._pass_on(claim, engine)
-        match stop:
-            case _Stop.LOST:
-                return Outcome.LOST
-            case _Stop.CANCEL:
-                return self._cancelled(claim)
-            case _Stop.SHUTDOWN:
-                return self._release(claim, refund=True)
-            case _Stop.TIMEOUT:
-                return self._fail(
-                    claim,
-                    "engine.timeout",
-                    f"The reconstruction did not finish within {self._settings.job_timeout:g} s.",
-                    "Submit a shorter clip, or a lower preset.",
-                )
-            case _Stop.EXITED:
-                if resumed and (code != 0 or missing_outputs(run, claim.kind)):
-                    # It may be the checkpoint that breaks the engine: the next attempt begins anew.
-                    drop_checkpoint(run)
-                outcome = self._conclude(claim, lease, engine, code, run)
-                if outcome is Outcome.FAILED:
-                    drop_checkpoint(run)
-                return outcome
+            self._tell(claim, engine.new_lines(), engine.warnings)
+        return engine, stop, code
 
-    def _watch(self, claim: Claim, lease: Lease, engine: EngineProcess) -> _Stop:
-        deadline = self._clock() + self._settings.job_timeout
+    def _watch(self, claim: Claim, lease: Lease, engine: EngineProcess, deadline: float) -> _Stop:
         shown: EngineProgress | None = None
         while engine.wait(_TICK_SECONDS) is None:
             if self._stopping.is_set():
@@ -241,7 +274,7 @@ class Supervisor:
             answer = lease.check()
             if answer is not Heartbeat.OK:
                 return _Stop.CANCEL if answer is Heartbeat.CANCEL else _Stop.LOST
-            self._pass_on(claim, engine)
+            self._tell(claim, engine.new_lines(), engine.warnings)
             if engine.progress is not shown:
                 shown = engine.progress
                 self._show(claim, engine.progress)
@@ -263,16 +296,26 @@ class Supervisor:
             # Progress may be missed; the lease decides how long to go on without a database.
             log.warning("job %s: progress not written (%s)", claim.job_id, type(error).__name__)
 
-    def _pass_on(self, claim: Claim, engine: EngineProcess) -> None:
-        """Give the job's owner what the engine said."""
-        lines = engine.new_lines()
+    def _tell(self, claim: Claim, lines: list[str], warnings: list[dict[str, str]]) -> None:
+        """Give the job's owner what was said."""
         if lines:
             try:
                 self._store.log(claim.job_id, claim.token, lines)
-                if engine.warnings:
-                    self._store.report_warnings(claim.job_id, claim.token, engine.warnings)
+                if warnings:
+                    self._store.report_warnings(claim.job_id, claim.token, warnings)
             except SQLAlchemyError as error:
                 log.warning("job %s: log not written (%s)", claim.job_id, type(error).__name__)
+
+    def _out_of_memory(self, claim: Claim, setting: Setting, run: Path) -> Outcome:
+        drop_checkpoint(run)
+        tried = "".join(f", nor {words}" for words in setting.changed)
+        return self._fail(
+            claim,
+            OUT_OF_MEMORY,
+            f"The GPU's memory did not suffice as asked{tried}.",
+            "Submit it with the device cpu, or a shorter or smaller video; whoever runs the service should "
+            "see that no other program uses the worker's GPU.",
+        )
 
     def _conclude(self, claim: Claim, lease: Lease, engine: EngineProcess, code: int, run: Path) -> Outcome:
         said = engine.failure
@@ -284,9 +327,9 @@ class Supervisor:
         elif code == _EXIT_BAD_ARGUMENTS:
             log.error("job %s: the engine refused its arguments: %s", claim.job_id, engine.tail)
             message = said.message if said else "The engine does not accept these options."
-            return self._fail(
-                claim, "options.invalid", message, (said and said.advice) or "Submit with other options."
-            )
+            # That this machine lacks a GPU is not the owner's doing.
+            word = DEVICE_UNAVAILABLE if said and said.code == DEVICE_UNAVAILABLE else "options.invalid"
+            return self._fail(claim, word, message, (said and said.advice) or "Submit with other options.")
         elif code == _EXIT_BAD_INPUT and said is not None and said.code:
             outcome = self._fail(claim, said.code, said.message, said.advice)
             if outcome is Outcome.FAILED:

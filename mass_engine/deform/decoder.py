@@ -16,9 +16,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from mass_engine import gpu
 from mass_engine.deform import _kernels
 from mass_engine.deform.native import shared_kernels
+from mass_engine.deform.precision import product
 from mass_engine.deform.residuals import Residuals
+from mass_engine.device import Precision
 from mass_engine.errors import BadArgumentError
 from mass_engine.raster.cpu import available_threads
 
@@ -54,8 +57,8 @@ def decode(
     """``surfel_share`` [N,H] and ``pose_share`` [B,H] of the first layer -> residuals [B,N]; differentiable.
 
     x = head(relu(second(relu(surfel_share + pose_share)))); offset and rotation are x in their units, the
-    log-scale is log 2 tanh x: no factor leaves [1/2, 2]. float32 with H a multiple of 16 up to 128 is
-    compiled, anything else is ``decode_reference``. ``threads``: None is every core this process may use.
+    log-scale is log 2 tanh x: no factor leaves [1/2, 2]. On the CPU float32 with H a multiple of 16 up to 128
+    is compiled, anything else is ``decode_reference``. ``threads``: None is every core this process may use.
     Raises BadArgumentError ``deform.shape`` and ``deform.instruction_set``.
     """
     tensors = (surfel_share, pose_share, *layers)
@@ -66,18 +69,28 @@ def decode(
         raise BadArgumentError(
             "deform.shape", f"The decoder's tensors are {shapes}.", "Give N,H; B,H; H,H; H; H,9 and 9."
         )
-    if hidden % 16 or hidden > 128 or any(tensor.dtype != torch.float32 for tensor in tensors):
+    plain = all(tensor.dtype == torch.float32 for tensor in tensors)
+    on_gpu = gpu.kernels_for(surfel_share)
+    if on_gpu is not None and plain and hidden in gpu.DECODER_WIDTHS and len(surfel_share):
+        return Residuals(*gpu.decode(on_gpu, units, *tensors))
+    if hidden % 16 or hidden > 128 or not plain or surfel_share.device.type != "cpu":
         return decode_reference(surfel_share, pose_share, layers, units)
     kernels = shared_kernels(instruction_set)
     out = _Decode.apply(kernels, threads or available_threads(), units, *tensors)  # type: ignore[no-untyped-call]
     return Residuals(*out)
 
 
-def decode_reference(surfel_share: Tensor, pose_share: Tensor, layers: Layers, units: Units) -> Residuals:
-    """As ``decode``, in plain torch and any dtype."""
+def decode_reference(
+    surfel_share: Tensor,
+    pose_share: Tensor,
+    layers: Layers,
+    units: Units,
+    precision: Precision = "float32",
+) -> Residuals:
+    """As ``decode``, in plain torch and any dtype, with matrix products of some ``precision``."""
     hidden = torch.relu(surfel_share + pose_share.unsqueeze(-2))
-    refined = torch.relu(hidden @ layers.second + layers.second_bias)
-    out = refined @ layers.head + layers.head_bias
+    refined = torch.relu(product(hidden, layers.second, precision) + layers.second_bias)
+    out = product(refined, layers.head, precision) + layers.head_bias
     offset, log_scale, rotation, mask_logit = out.split([3, 2, 3, 1], -1)
     return Residuals(
         offset * units.offset,

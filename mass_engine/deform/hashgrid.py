@@ -135,11 +135,11 @@ class HashGrid(nn.Module):
             rows = np.arange(len(unit) + 1)
             ones = np.ones(len(unit))
             pairs.append(sp.csr_array((ones, faces.numpy(), rows), shape=(len(unit), self.face_count)))
-        self._matrices = [(to_torch_csr(m), to_torch_csr(sp.csr_array(m.T))) for m in pairs]
+        self.matrices = [(to_torch_csr(m), to_torch_csr(sp.csr_array(m.T))) for m in pairs]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         """Other dtypes: the matrices go along (they are no buffers, a file has no use for them)."""
-        self._matrices = [(fn(matrix), fn(transpose)) for matrix, transpose in self._matrices]
+        self.matrices = [(fn(matrix), fn(transpose)) for matrix, transpose in self.matrices]
         return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def forward(self) -> Tensor:
@@ -147,7 +147,7 @@ class HashGrid(nn.Module):
         tables = [*self.tables, self.face_table] if self.config.face_features else list(self.tables)
         parts = [
             fixed_product(matrix, transpose, table)
-            for (matrix, transpose), table in zip(self._matrices, tables, strict=True)
+            for (matrix, transpose), table in zip(self.matrices, tables, strict=True)
         ]
         return torch.cat(parts, -1)
 

@@ -7,6 +7,7 @@ module changes nothing at all.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -15,9 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mass_engine.deform.decoder import OUTPUTS, Layers, Units, decode
+from mass_engine.deform.decoder import OUTPUTS, Layers, Units, decode, decode_reference
 from mass_engine.deform.hashgrid import HashGrid, HashGridConfig
+from mass_engine.deform.precision import product
 from mass_engine.deform.residuals import Residuals
+from mass_engine.device import Precision
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.hand.rotation import axis_angle_to_matrix
 
@@ -87,7 +90,8 @@ def pose_features(hand_pose: Tensor, betas: Tensor) -> Tensor:
             f"hand_pose is {tuple(hand_pose.shape)}, betas {tuple(betas.shape)}.",
             "Give [B,45] and [B,10].",
         )
-    turns = axis_angle_to_matrix(hand_pose.reshape(-1, 15, 3)) - torch.eye(3).to(hand_pose)
+    rest = torch.eye(3, dtype=hand_pose.dtype, device=hand_pose.device)
+    turns = axis_angle_to_matrix(hand_pose.reshape(-1, 15, 3)) - rest
     return torch.cat([turns.flatten(1), betas], -1)
 
 
@@ -109,6 +113,8 @@ class Deformation(nn.Module):
     ) -> None:
         super().__init__()
         self.config, self.cube = config, cube
+        #: Of the layers' products; what is trained with another than float32 is trained by torch's operators.
+        self.precision: Precision = "float32"
         self.grid = HashGrid(config.grid, cube.coordinates(centroids), faces, face_count, generator)
         width, hidden = config.grid.width, config.hidden
 
@@ -126,7 +132,14 @@ class Deformation(nn.Module):
 
     def forward(self, hand_pose: Tensor, betas: Tensor) -> Residuals:
         """Residuals [B,N] for ``hand_pose`` [B,45] and ``betas`` [B,10]; differentiable."""
-        return self._decoder(self.grid() @ self.first_hash).residuals(hand_pose, betas)
+        share = product(self.grid(), self.first_hash, self.precision)
+        return self._decoder(share).residuals(hand_pose, betas, self.precision)
+
+    def copied_to(self, device: torch.device | str) -> Deformation:
+        """A copy elsewhere, with weights of its own."""
+        # Sparse tensors cannot be copied this way, and constants need not be.
+        constants = {id(matrix): matrix for pair in self.grid.matrices for matrix in pair}
+        return copy.deepcopy(self, constants).to(device)
 
     def freeze(self) -> FrozenDeformation:
         """For inference: the hash grid's share of the first layer becomes one constant row a surfel."""
@@ -179,11 +192,24 @@ class FrozenDeformation:
     first_bias: Tensor
     layers: Layers
 
+    def to(self, device: torch.device | str) -> FrozenDeformation:
+        """The same deformation elsewhere."""
+        return FrozenDeformation(
+            self.config,
+            self.surfel_share.to(device),
+            self.first_pose.to(device),
+            self.first_bias.to(device),
+            Layers(*(v.to(device) for v in self.layers)),
+        )
+
     def pose_share(self, hand_pose: Tensor, betas: Tensor) -> Tensor:
         """The poses' part [B,H] of the first layer."""
         return pose_features(hand_pose, betas) @ self.first_pose + self.first_bias
 
-    def residuals(self, hand_pose: Tensor, betas: Tensor) -> Residuals:
+    def residuals(self, hand_pose: Tensor, betas: Tensor, precision: Precision = "float32") -> Residuals:
         """Residuals [B,N] for ``hand_pose`` [B,45] and ``betas`` [B,10]."""
         units = Units(self.config.offset_unit, self.config.rotation_unit)
-        return decode(self.surfel_share, self.pose_share(hand_pose, betas), self.layers, units)
+        share = self.pose_share(hand_pose, betas)
+        if precision != "float32":
+            return decode_reference(self.surfel_share, share, self.layers, units, precision)
+        return decode(self.surfel_share, share, self.layers, units)

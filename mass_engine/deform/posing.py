@@ -7,7 +7,7 @@ gradients: each surfel is read and written once, where torch takes some forty pa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ _LANES = 16
 
 @dataclass(frozen=True)
 class MeshPose:
-    """One pose as the surfels see it.
+    """One pose as the surfels see it, or several: then every tensor begins with [B].
 
     ``refined`` [V',3] vertices of the subdivided mesh, metres; ``bone_rotations`` [16,3,3] from rest;
     ``center`` [3] of the camera; ``hand_pose`` [45] and ``betas`` [10] for the deformation.
@@ -42,7 +42,7 @@ class MeshPose:
 
 @dataclass(frozen=True)
 class ShadedSurfels:
-    """Surfels of one pose: what ``raster.rasterize`` takes, and their normals.
+    """Surfels of one pose (or of B): what ``raster.rasterize`` takes, and their normals.
 
     ``means`` [M,3], ``tangents`` [M,2,3], ``normals`` [M,3], ``opacities`` [M], ``colors`` [M,3].
     """
@@ -52,6 +52,10 @@ class ShadedSurfels:
     normals: Tensor
     opacities: Tensor
     colors: Tensor
+
+    def row(self, row: int) -> ShadedSurfels:
+        """Those of one pose of several."""
+        return ShadedSurfels(*(getattr(self, field.name)[row] for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -105,31 +109,44 @@ class PosableSurfels:
 
     def posed(self, pose: MeshPose) -> ShadedSurfels:
         """The surfels in a pose, in plain torch: the specification of the compiled pass."""
+        many = self.posed_batch(MeshPose(*(getattr(pose, field.name)[None] for field in fields(pose))))
+        return many.row(0)
+
+    def posed_batch(self, poses: MeshPose) -> ShadedSurfels:
+        """The surfels in B poses, [B,M,...], in plain torch; every tensor of ``poses`` begins with B."""
         with torch.no_grad():
-            every = self.binding.register(pose.refined)
-            surfels = AttachedSurfels(
-                every.means[self.sources], every.tangents[self.sources], every.normals[self.sources]
-            )
-            opacities = self.opacities
+            every = self.binding.register(poses.refined)
+            surfels = AttachedSurfels(*(v[:, self.sources] for v in _parts(every)))
+            opacities = self.opacities.expand(len(poses.refined), -1)
             if self.deformation is not None:
                 start = self.deformed_from
-                residuals = self.deformation.residuals(pose.hand_pose[None], pose.betas[None])
-                moving = AttachedSurfels(*(v[None, start:] for v in _parts(surfels)))
+                residuals = self.deformation.residuals(poses.hand_pose, poses.betas)
+                moving = AttachedSurfels(*(v[:, start:] for v in _parts(surfels)))
                 moved = deform_reference(moving, residuals)
-                surfels = AttachedSurfels(
-                    *(
-                        torch.cat([old[:start], new[0]])
-                        for old, new in zip(_parts(surfels), _parts(moved), strict=True)
-                    )
-                )
-                opacities = torch.cat([opacities[:start], opacities[start:] * residuals.mask[0]])
+                both = zip(_parts(surfels), _parts(moved), strict=True)
+                surfels = AttachedSurfels(*(torch.cat([old[:, :start], new], 1) for old, new in both))
+                opacities = torch.cat([opacities[:, :start], opacities[:, start:] * residuals.mask], 1)
             colors = shade(self.albedo, self.light, surfels.normals)
             if self.sh.shape[1]:
-                directions = torch.nn.functional.normalize(surfels.means - pose.center, dim=-1)
+                away = surfels.means - poses.center.unsqueeze(1)
+                directions = torch.nn.functional.normalize(away, dim=-1)
                 bones = self.binding.bones[self.sources]
-                turned = (directions.unsqueeze(-2) @ pose.bone_rotations[bones]).squeeze(-2)
+                turned = (directions.unsqueeze(-2) @ poses.bone_rotations[:, bones]).squeeze(-2)
                 colors = (colors + evaluate_sh_rest(self.sh, turned)).clamp_min(0.0)
             return ShadedSurfels(*_parts(surfels), opacities, colors)
+
+    def to(self, device: torch.device | str) -> PosableSurfels:
+        """The same surfels elsewhere."""
+        return PosableSurfels(
+            self.binding.to(device),
+            self.sources.to(device),
+            self.albedo.to(device),
+            self.opacities.to(device),
+            self.sh.to(device),
+            self.light.to(device),
+            None if self.deformation is None else self.deformation.to(device),
+            self.deformed_from,
+        )
 
     def compiled(self) -> CompiledSurfels:
         """The same laid out for the compiled pass: a copy, later changes of the tensors do not reach it."""

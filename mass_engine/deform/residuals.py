@@ -6,13 +6,14 @@ the hand.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mass_engine.deform import _kernels
+from mass_engine import gpu
 from mass_engine.deform.native import shared_kernels
 from mass_engine.errors import BadArgumentError
 from mass_engine.raster.cpu import available_threads
@@ -72,8 +73,9 @@ def deform(
 ) -> AttachedSurfels:
     """The deformed surfels; differentiable in both. Shapes [B,N] as in ``Residuals``, or any other [...].
 
-    float32 is compiled, anything else is ``deform_reference``. ``threads``: None is every core this process
-    may use. Raises BadArgumentError ``deform.shape`` and ``deform.instruction_set``.
+    float32 is compiled (for a GPU if its kernels are built), anything else is ``deform_reference``.
+    ``threads``: None is every core this process may use. Raises BadArgumentError ``deform.shape`` and
+    ``deform.instruction_set``.
     """
     tensors = (
         surfels.means,
@@ -89,22 +91,41 @@ def deform(
         raise BadArgumentError(
             "deform.shape", f"Surfels and residuals are {shapes}.", "Give a residual for each surfel."
         )
+    kernels = gpu.kernels_for(surfels.means)
     if any(tensor.dtype != torch.float32 for tensor in tensors):
         return deform_reference(surfels, residuals)
-    kernels = shared_kernels(instruction_set)
-    out = _Deform.apply(kernels, threads or available_threads(), *tensors)  # type: ignore[no-untyped-call]
+    if kernels is not None:
+        return deform_by(gpu.deform_passes(kernels), surfels, residuals)
+    if surfels.means.device.type != "cpu":
+        return deform_reference(surfels, residuals)
+    compiled: Any = shared_kernels(instruction_set)
+    count = threads or available_threads()
+    passes = (
+        lambda *given: compiled.deform(*given, count),
+        lambda *given: compiled.deform_backward(*given, count),
+    )
+    return deform_by(passes, surfels, residuals)
+
+
+def deform_by(
+    passes: tuple[Callable[..., None], Callable[..., None]], surfels: AttachedSurfels, residuals: Residuals
+) -> AttachedSurfels:
+    """As ``deform``, by a compiled forward and backward pass: given tensors first, then those to fill."""
+    given = (surfels.means, surfels.tangents, surfels.normals)
+    changes = (residuals.offset, residuals.log_scale, residuals.rotation)
+    out = _Deform.apply(passes, *given, *changes)  # type: ignore[no-untyped-call]
     return AttachedSurfels(*out)
 
 
 class _Deform(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, kernels: _kernels.Kernels, threads: int, *tensors: Tensor
+        ctx: Any, passes: tuple[Callable[..., None], Callable[..., None]], *tensors: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         given = [tensor.detach().contiguous() for tensor in tensors]
         means, tangents, normals = (torch.empty_like(tensor) for tensor in given[:3])
-        kernels.deform(*given, means, tangents, normals, threads)  # type: ignore[call-arg, arg-type]
-        ctx.kernels, ctx.threads = kernels, threads
+        passes[0](*given, means, tangents, normals)
+        ctx.back = passes[1]
         ctx.save_for_backward(*given[1:])
         return means, tangents, normals
 
@@ -113,8 +134,8 @@ class _Deform(torch.autograd.Function):
         given = ctx.saved_tensors
         arrived = [gradient.contiguous() for gradient in gradients]
         out = [torch.empty_like(tensor) for tensor in given]
-        ctx.kernels.deform_backward(*given, *arrived, *out, ctx.threads)
-        return (None, None, gradients[0], *out)
+        ctx.back(*given, *arrived, *out)
+        return (None, gradients[0], *out)
 
 
 def deform_reference(surfels: AttachedSurfels, residuals: Residuals) -> AttachedSurfels:

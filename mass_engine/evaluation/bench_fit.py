@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import platform
@@ -11,9 +12,10 @@ from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from mass_engine.device import DEVICES
 from mass_engine.evaluation.demo_clip import ClipOptions, demo_frames
 from mass_engine.fitting.report import FitReport
-from mass_engine.options import PRESETS, FitOptions
+from mass_engine.options import PRECISIONS, PRESETS, FitOptions
 from mass_engine.pipeline import fit
 from mass_engine.video.writer import write_video
 
@@ -27,6 +29,14 @@ def run(argv: Sequence[str]) -> None:
     parser.add_argument("--preset", choices=PRESETS, nargs="+", default=["auto"])
     parser.add_argument("--holdout", type=int, default=8)
     parser.add_argument("--max-frames", type=int, default=FitOptions.max_frames)
+    parser.add_argument("--device", choices=DEVICES, default="auto")
+    parser.add_argument(
+        "--precision",
+        choices=PRECISIONS,
+        nargs="+",
+        default=["float32"],
+        help="of the matrix products on a GPU: each in turn, for its seconds and its dB",
+    )
     parser.add_argument("--out", type=Path, metavar="FILE.json", help="the whole reports")
     arguments = parser.parse_args(argv)
     with TemporaryDirectory() as folder:
@@ -37,12 +47,16 @@ def run(argv: Sequence[str]) -> None:
         reports = []
         print(f"{platform.machine()}, {os.cpu_count()} cores\n", flush=True)
         for video in videos:
-            for preset in arguments.preset:
+            for preset, precision in itertools.product(arguments.preset, arguments.precision):
                 options = FitOptions(
-                    preset=preset, holdout=arguments.holdout, max_frames=arguments.max_frames
+                    preset=preset,
+                    holdout=arguments.holdout,
+                    max_frames=arguments.max_frames,
+                    device=arguments.device,
+                    precision=precision,
                 )
                 reports.append(fit(video, options).report)
-                _print(reports[-1], preset)
+                _print(reports[-1], preset if precision == "float32" else f"{preset}, {precision}")
     if arguments.out is not None:
         arguments.out.write_text(json.dumps([asdict(report) for report in reports], indent=1) + "\n")
 
@@ -56,6 +70,9 @@ def _print(report: FitReport, preset: str) -> None:
         "stage 1, texture": registration,
     }
     total = sum(report.seconds.values())
+    on_gpu = report.machine.get("gpu_peak_memory_bytes")
+    if on_gpu is not None:
+        print(f"{report.machine['gpu']}: {on_gpu / 2**30:.2f} GiB of its memory at most\n")
     print(
         f"{report.video['name']}, {preset}: {len(report.frames['fitted'])} frames fitted, "
         f"{report.surfels['kept']} surfels, {total:.0f} s of which the fit {report.seconds['fit']:.0f} s, "

@@ -16,9 +16,9 @@ from pathlib import Path
 import torch
 
 from mass_engine.camera import Camera
-from mass_engine.evaluation import raster_profile
+from mass_engine.evaluation import raster_cuda, raster_profile
 from mass_engine.evaluation.raster_scene import Scene, hand_camera, hand_scene
-from mass_engine.evaluation.timing import Step, forward_step, measure, training_step
+from mass_engine.evaluation.timing import Step, Timing, forward_step, measure, training_step
 from mass_engine.raster import RasterOptions
 from mass_engine.raster import cpu as cpu_backend
 from mass_engine.raster._kernels import instruction_sets
@@ -60,8 +60,11 @@ def run(argv: Sequence[str]) -> int:
     parser.add_argument("--reference", action="store_true", help="also time the torch reference (minutes)")
     parser.add_argument("--ablate", action="store_true", help="what each optimisation is worth instead")
     parser.add_argument("--profile", action="store_true", help="where the time goes instead, and the floor")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--out", type=Path, default=None, help="JSON file")
     args = parser.parse_args(argv)
+    if args.device == "cuda":
+        return _run_cuda(args)
 
     threads = args.threads or cpu_backend.available_threads()
     print(f"{cpu_backend.shared_renderer().instruction_set}, {threads} threads; median ms [quartiles]\n")
@@ -89,13 +92,39 @@ def run(argv: Sequence[str]) -> int:
                     print("| surfels | size | " + " | ".join(header) + " |")
                     print("|---" * (len(header) + 2) + "|")
                 print(f"| {count} | {size} | " + " | ".join(map(str, timings.values())) + " |", flush=True)
-            rows += [
-                Row(count, size, name, timing.median, timing.quartiles, timing.repetitions)
-                for name, timing in timings.items()
-            ]
-    if args.out:
-        text = {"threads": threads, "torch": torch.__version__, "rows": [asdict(row) for row in rows]}
-        args.out.write_text(json.dumps(text, indent=1) + "\n")
+            rows += [_row(count, size, name, timing) for name, timing in timings.items()]
+    _write(args.out, {"threads": threads}, rows)
+    return 0
+
+
+def _write(path: Path | None, where: dict[str, object], rows: list[Row]) -> None:
+    if path:
+        text = {**where, "torch": torch.__version__, "rows": [asdict(row) for row in rows]}
+        path.write_text(json.dumps(text, indent=1) + "\n")
+
+
+def _run_cuda(args: argparse.Namespace) -> int:
+    """The same scenes on a GPU. Raises ``EngineError`` ``device.unavailable``."""
+    device = raster_cuda.require()
+    name = torch.cuda.get_device_name()
+    print(f"{name}; median ms [quartiles], peak MiB\n")
+    rows: list[Row] = []
+    for count in args.counts:
+        on_cpu = hand_scene(count)
+        scene = on_cpu.to(device)
+        for size in args.sizes:
+            width, height = (int(x) for x in size.split("x"))
+            camera = hand_camera(on_cpu, width, height)
+            moved = Camera(camera.K.to(device), camera.world_to_camera.to(device), width, height)
+            steps, pairs = raster_cuda.variants(scene, moved)
+            figures = raster_cuda.measure(steps | raster_cuda.gsplat_variants(scene, moved), args.seconds)
+            print(f"{count} surfels, {size}, {pairs} pairs of surfel and tile\n")
+            print("| | ms | peak MiB |\n|---|---|---|")
+            for what, figure in figures.items():
+                print(f"| {what} | {figure.timing} | {figure.peak_bytes / 2**20:.0f} |")
+                rows.append(_row(count, size, what, figure.timing, figure.peak_bytes))
+            print("\n" + raster_cuda.floor(on_cpu, camera, pairs), flush=True)
+    _write(args.out, {"device": name}, rows)
     return 0
 
 
@@ -109,6 +138,11 @@ class Row:
     median_ms: float
     quartiles_ms: tuple[float, float]
     repetitions: int
+    peak_bytes: int | None = None  # of device memory
+
+
+def _row(surfels: int, size: str, what: str, timing: Timing, peak_bytes: int | None = None) -> Row:
+    return Row(surfels, size, what, timing.median, timing.quartiles, timing.repetitions, peak_bytes)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,8 @@
-"""``mass-engine bench render``: pose to pixels, milliseconds a picture on this machine."""
+"""``mass-engine bench render``: pose to pixels, milliseconds a picture on this machine.
+
+On a GPU batches of poses are one graph, launched again and again; times are the device's own, between events,
+and the floor is what must be moved at least, over what the memory moves in a copy on the same device.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,11 +21,15 @@ from torch import Tensor
 from mass_engine.camera import Camera
 from mass_engine.deform.network import Deformation, DeformationConfig, UnitCube
 from mass_engine.deform.posing import CompiledSurfels, MeshPose, PosableSurfels, ShadedSurfels
+from mass_engine.device import DEVICES, choose_device
+from mass_engine.evaluation.device_timing import copy_bandwidth, device_times
 from mass_engine.evaluation.raster_scene import framing_camera
+from mass_engine.fitting.subject import Shape
 from mass_engine.hand.builtin import load_builtin
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
 from mass_engine.hand.poses import named_pose
+from mass_engine.many_poses import BATCH, ManyPoses
 from mass_engine.raster import RasterOptions, RenderOutput, rasterize
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import white_light
@@ -55,12 +64,15 @@ def run(argv: Sequence[str]) -> None:
     """Print a Markdown table of medians: posing, deforming and rasterising the built-in hand."""
     parser = argparse.ArgumentParser(prog="mass-engine bench render")
     parser.add_argument("--repeat", type=int, default=20)
-    repeat: int = parser.parse_args(argv).repeat
-    model = load_builtin("right")
-    point = named_pose("point", "right")
-    # Fingers up, back of the hand to the camera, filling the picture's height.
-    orient = torch.tensor([-1.2092, -1.2092, 1.2092])
-    pose = HandPose(point.betas, orient, point.hand_pose, torch.zeros(3), "right")
+    parser.add_argument("--device", choices=DEVICES, default="cpu")
+    parser.add_argument("--batch", type=int, nargs="+", default=[1, BATCH], help="poses a launch, on a GPU")
+    arguments = parser.parse_args(argv)
+    repeat: int = arguments.repeat
+    device = choose_device(arguments.device)
+    if device.type == "cuda":
+        _on_gpu(device, repeat, arguments.batch)
+        return
+    model, pose = load_builtin("right"), _pose()
     vertices = model.posed(pose).vertices
     print(f"{platform.machine()}, {os.cpu_count()} cores, median of {repeat} (least to greatest), ms\n")
     print("| surfels | deformed | size | pose to surfels | pose to pixels | frames a second |")
@@ -94,6 +106,52 @@ def run(argv: Sequence[str]) -> None:
                 f"| {len(surfels.sources)} | {case.deformed} | {width}x{height} | {first:.1f} "
                 f"| {median:.1f} ({least:.1f} to {most:.1f}) | {1000 / median:.0f} |"
             )
+
+
+def _pose() -> HandPose:
+    """Fingers up, back of the hand to the camera."""
+    point = named_pose("point", "right")
+    orient = torch.tensor([-1.2092, -1.2092, 1.2092])
+    return HandPose(point.betas, orient, point.hand_pose, torch.zeros(3), "right")
+
+
+def _on_gpu(device: torch.device, repeat: int, batches: Sequence[int]) -> None:
+    """The same table for a GPU, for several numbers of poses a launch."""
+    model, pose = load_builtin("right"), _pose()
+    shape = Shape.mean(model, torch.zeros(10))
+    vertices = model.posed(pose).vertices
+    copied = copy_bandwidth(device)
+    print(f"{torch.cuda.get_device_name(device)}, {copied / 1e9:.0f} GB/s in a copy, median of {repeat}\n")
+    print(
+        "| surfels | deformed | size | batch | pose to pixels, ms | frames a second | floor, ms | peak, MiB |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for case in MODELS:
+        surfels = _surfels(model, MeshBinding.build(model, case.levels, case.depth), case)
+        for width, height in SIZES:
+            camera = framing_camera(vertices, width, height)
+            for batch in batches:
+                torch.cuda.reset_peak_memory_stats(device)
+                many = ManyPoses(shape, surfels, width, height, device, batch)
+                poses = HandPose(
+                    pose.betas.expand(batch, -1),
+                    pose.global_orient.expand(batch, -1),
+                    pose.hand_pose.expand(batch, -1),
+                    pose.transl.expand(batch, -1),
+                    pose.side,
+                )
+                cameras = [camera] * batch
+                while many.lacked_room(many.draw(poses, cameras)):
+                    pass
+                spent, _, _ = device_times(partial(many.draw, poses, cameras), repeat)
+                # Read every surfel's constants, write and read it posed, write the picture: not less.
+                least = 4.0 * (len(surfels.sources) * (17 + 2 * 15) + width * height * 5)
+                print(
+                    f"| {len(surfels.sources)} | {case.deformed} | {width}x{height} | {batch} "
+                    f"| {spent / batch:.3f} | {1000 * batch / spent:.0f} | {1000 * least / copied:.4f} "
+                    f"| {torch.cuda.max_memory_allocated(device) / 2**20:.0f} |",
+                    flush=True,
+                )
 
 
 def _surfels(model: HandModel, binding: MeshBinding, case: Model) -> PosableSurfels:

@@ -19,7 +19,7 @@ from mass_engine.raster.types import OPTIMIZATIONS
 _REPETITIONS = 15
 #: 512-bit instructions of one (surfel, block) evaluation, counted in the loops g++ 12 makes: the low-pass
 #: part alone, the whole. Colour, alpha and depth; the sum over lanes, once a pair, is not in it.
-_INSTRUCTIONS = {"forward": (42, 63), "backward": (57, 110)}
+INSTRUCTIONS = {"forward": (42, 63), "backward": (57, 110)}
 #: Bytes a surfel brings in (mean, tangents, opacity, colour) and its splat, box and key.
 _INPUT_BYTES, _SPLAT_BYTES = 52, 64 + 8 + 4
 #: Bytes a pair of surfel and tile takes while it is listed and sorted: written, read and moved once.
@@ -68,6 +68,18 @@ def copy_bandwidth() -> float:
     return 2 * source.numel() * 4 / statistics.median(times)
 
 
+def evaluations(scene: Scene, camera: Camera) -> dict[str, float]:
+    """(Surfel, 4 x 4 block) evaluations of the forward and of the backward pass, counted on the CPU."""
+    tensors = [t.detach().cpu() for t in (*scene.tensors(), camera.world_to_camera, camera.K)]
+    leaves = [t.requires_grad_() for t in tensors]
+    call = Call(camera.width, camera.height, RasterOptions(), keep_frame=True)
+    images = call.run(*leaves)
+    torch.autograd.grad(images, leaves, [torch.ones_like(image) for image in images])
+    assert call.frame is not None
+    profile = call.frame.profile
+    return {"forward": profile["blocks"], "backward": profile["blocks_backward"]}
+
+
 def report(scene: Scene, camera: Camera, threads: int) -> str:
     """Markdown: milliseconds of each pass, the work done, and the floor by memory and by instructions."""
     options = RasterOptions(cull_backfaces=True, threads=threads)
@@ -105,7 +117,7 @@ def report(scene: Scene, camera: Camera, threads: int) -> str:
         f"{1e3 * moved / bandwidth:.2f} ms.",
     ]
     for name, blocks in (("forward", median["blocks"]), ("backward", median["blocks_backward"])):
-        low, high = (blocks * n / threads / 1e9 for n in _INSTRUCTIONS[name])
+        low, high = (blocks * n / threads / 1e9 for n in INSTRUCTIONS[name])
         lines.append(
             f"Instructions of the {name} blending: {low:.4f} to {high:.4f} G vector instructions a core; at "
             f"5.2 G a second (two a cycle at 2.6 GHz) {1e3 * low / 5.2:.2f} to {1e3 * high / 5.2:.2f} ms."

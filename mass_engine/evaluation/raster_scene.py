@@ -26,6 +26,10 @@ class Scene:
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.means, self.tangents, self.opacities, self.colors
 
+    def to(self, device: torch.device) -> Scene:
+        """The same on ``device``."""
+        return Scene(*(t.to(device) for t in self.tensors()))
+
 
 def hand_scene(count: int, pose_name: str = "point", seed: int = 0) -> Scene:
     """``count`` surfels in two layers on the posed hand, back of the hand towards -z, fingers up.

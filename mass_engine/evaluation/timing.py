@@ -74,9 +74,10 @@ def measure(steps: dict[str, Step], seconds: float, most: int = 60) -> dict[str,
             taken = time.perf_counter() - start
             times[name].append(1e3 * taken)
             spent[name] += taken
-    return {name: _summary(t) for name, t in times.items()}
+    return {name: summary(t) for name, t in times.items()}
 
 
-def _summary(times: list[float]) -> Timing:
+def summary(times: list[float]) -> Timing:
+    """Of ``times`` in milliseconds, two or more."""
     quartiles = statistics.quantiles(times, n=4)
     return Timing(statistics.median(times), (quartiles[0], quartiles[2]), len(times))

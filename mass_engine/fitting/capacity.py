@@ -24,18 +24,20 @@ DEFORMATION_GAIN = 0.05
 
 def best_pixels(scene: Scene, skin: Skin, side: int) -> Tensor:
     """Pixels [F'] of each refined face in the view that shows it largest (0: it never faced the camera)."""
+    home, scene = scene.device, scene.at_work()
+    skin = skin.to(scene.device)
     faces = skin.binding.subdivision.faces
-    best: Tensor = torch.zeros(len(faces))
+    best: Tensor = torch.zeros(len(faces), device=scene.device)
     for row in spread(scene.trained, SAMPLED_FRAMES):
         with torch.no_grad():
             vertices = scene.surfels(skin, row).outline_vertices[0]
-            camera = scene.views[row].level(side).camera
+            camera = scene.level(row, side).camera
             a, b, c = camera.project(vertices)[faces].unbind(1)
             u, v = b - a, c - a
             # Pixel rows run down: what faces the camera goes round clockwise, its signed area is negative.
             area = -0.5 * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
             best = torch.maximum(best, torch.where(torch.isfinite(area), area, torch.zeros_like(area)))
-    return best
+    return best.to(home)
 
 
 def thin(skin: Skin, evidence: Evidence, pixels: Tensor) -> tuple[Skin, Evidence, dict[str, int]]:

@@ -12,7 +12,7 @@ from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.registration import overlap
 from mass_engine.fitting.skin import Skin
 from mass_engine.fitting.subject import START_OPACITY, Appearance, PosedSurfels, Shape, draw, render_row
-from mass_engine.fitting.views import View
+from mass_engine.fitting.views import Level, View
 from mass_engine.raster import RasterOptions
 from mass_engine.surfel.binding import MeshBinding
 from mass_engine.surfel.shading import irradiance_basis, white_light
@@ -22,7 +22,8 @@ from mass_engine.surfel.shading import irradiance_basis, white_light
 class Scene:
     """The frames with their poses and one shape, as stage one left them.
 
-    ``gains`` [F,3] multiply the colours of each frame (exposure and white balance).
+    ``gains`` [F,3] multiply the colours of each frame (exposure and white balance). ``compute`` is where
+    passes over the frames run; their results come back to where the scene is.
     """
 
     views: list[View]
@@ -31,6 +32,35 @@ class Scene:
     raster: RasterOptions
     gains: Tensor
     validation: list[int] = field(default_factory=list)
+    compute: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the scene is."""
+        return self.gains.device
+
+    def to(self, device: torch.device | str) -> Scene:
+        """The same scene elsewhere, as it is now (itself if it is there)."""
+        if self.device == torch.device(device):
+            return self
+        return Scene(
+            self.views,
+            self.table.to(device),
+            self.shape.to(device),
+            self.raster,
+            self.gains.to(device),
+            self.validation,
+            self.compute,
+        )
+
+    def at_work(self) -> Scene:
+        """The scene where passes over it run (itself on a CPU)."""
+        return self.to(self.compute)
+
+    def level(self, row: int, side: int) -> Level:
+        """The pixels of one row where the scene is."""
+        level = self.views[row].level(side)
+        return level if self.device.type == "cpu" else level.to(self.device)
 
     @property
     def trained(self) -> list[int]:
@@ -40,8 +70,7 @@ class Scene:
 
     def surfels(self, skin: Skin, row: int) -> PosedSurfels:
         """One row's surfels (a batch of one)."""
-        only = torch.tensor([row])
-        leaves = {name: value[only] for name, value in self.table.values.items()}
+        leaves = {name: value[row : row + 1] for name, value in self.table.values.items()}
         return skin.pose(self.shape, self.table.pose(self.shape.betas, leaves))
 
     def overlaps(self, skin: Skin, appearance: Appearance, rows: Sequence[int], side: int = 160) -> Tensor:
@@ -66,6 +95,10 @@ class Evidence:
     background: Tensor
     albedo: Tensor
 
+    def to(self, device: torch.device | str) -> Evidence:
+        """The same elsewhere."""
+        return Evidence(*(v.to(device) for v in (self.hand, self.ignored, self.background, self.albedo)))
+
 
 def spread(rows: Sequence[int], count: int) -> list[int]:
     """Up to ``count`` of the rows, evenly."""
@@ -86,14 +119,16 @@ def gather(
     The gradient of ``sum(render * picture)`` with respect to the colours is, surfel by surfel, the sum
     of the picture under its blending weights: one backward pass gathers a whole frame.
     """
-    size = skin.count
-    hand, ignored, background = torch.zeros(size), torch.zeros(size), torch.zeros(size)
-    numerator, denominator = torch.zeros(size, 3), torch.zeros(size, 3)
-    opacities = torch.full((size,), START_OPACITY)
+    home, scene = scene.device, scene.at_work()
+    size, device = skin.count, scene.device
+    skin, light = skin.to(device), light.to(device)
+    hand, ignored, background = (torch.zeros(size, device=device) for _ in range(3))
+    numerator, denominator = torch.zeros(size, 3, device=device), torch.zeros(size, 3, device=device)
+    opacities = torch.full((size,), START_OPACITY, device=device)
     for done, row in enumerate(rows):
         with torch.no_grad():
-            level, surfels = scene.views[row].level(side), scene.surfels(skin, row)
-        colors = torch.zeros(size, 3, requires_grad=True)
+            level, surfels = scene.level(row, side), scene.surfels(skin, row)
+        colors = torch.zeros(size, 3, device=device, requires_grad=True)
         out = draw(surfels.row(0), opacities, colors, level.camera, scene.raster)
         cover, usable = level.hand.unsqueeze(-1), level.colored.unsqueeze(-1)
         picture = level.rgb / scene.gains[row]
@@ -112,7 +147,7 @@ def gather(
         if progress is not None:
             progress((done + 1) / len(rows))
     albedo = torch.where(denominator > 1e-3, numerator / denominator.clamp_min(1e-3), 0.0)
-    return Evidence(hand, ignored, background, albedo)
+    return Evidence(hand, ignored, background, albedo).to(home)
 
 
 def colors_of(scene: Scene, skin: Skin, row: int) -> Tensor:
@@ -127,10 +162,12 @@ def frame_gains(scene: Scene, skin: Skin, appearance: Appearance, side: int) -> 
     Held-out rows lie between their neighbours in time: their own colours are not looked at.
     """
     known = [row for row, view in enumerate(scene.views) if not view.heldout]
-    logs = torch.zeros(len(scene.views), 3)
+    home, scene = scene.device, scene.at_work()
+    skin, appearance = skin.to(scene.device), appearance.to(scene.device)
+    logs = torch.zeros(len(scene.views), 3, device=scene.device)
     for row in known:
         with torch.no_grad():
-            level = scene.views[row].level(side)
+            level = scene.level(row, side)
             out = render_row(appearance, scene.surfels(skin, row), 0, skin.bones, level.camera, scene.raster)
         inner = (level.hand * level.colored * (out.alpha > 0.95)).unsqueeze(-1)
         top, bottom = (inner * level.rgb * out.rgb).sum((0, 1)), (inner * out.rgb.square()).sum((0, 1))
@@ -142,7 +179,7 @@ def frame_gains(scene: Scene, skin: Skin, appearance: Appearance, side: int) -> 
         if view.heldout:
             near = sorted(known, key=lambda other: abs(float(times[other] - times[row])))[:2]
             logs[row] = logs[near].mean(0)
-    return logs.exp()
+    return logs.exp().to(home)
 
 
 def fill_unseen(evidence: Evidence, skin: Skin, least: float) -> Tensor:

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from mass_engine import gpu
+
 _C1, _C2 = 0.01**2, 0.03**2
 
 
@@ -53,9 +55,12 @@ def dssim(rgb: Tensor, target: Tensor, valid: Tensor) -> Tensor:
     Grey and a box are what a CPU does fast, and structure is in the grey values; the reported metric uses
     three channels and the Gaussian window (evaluation.metrics).
     """
+    kernels = gpu.kernels_for(rgb)
+    if kernels is not None and not target.requires_grad:
+        return gpu.dssim(kernels, rgb, target, valid)
     x, y = rgb.mean(-1), target.mean(-1)
     planes = torch.stack([x, y, x * x, y * y, x * y]).unsqueeze(0)
-    row = torch.full((5, 1, 1, 7), 1 / 7, dtype=planes.dtype)
+    row = torch.full((5, 1, 1, 7), 1 / 7, dtype=planes.dtype, device=planes.device)
     planes = functional.conv2d(planes, row, padding=(0, 3), groups=5)
     planes = functional.conv2d(planes, row.transpose(2, 3), padding=(3, 0), groups=5)
     mx, my, xx, yy, xy = planes[0]

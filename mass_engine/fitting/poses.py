@@ -28,6 +28,11 @@ class PoseTable:
         self._depth = pose.transl[:, 2].detach().abs().clamp_min(0.05)
         self.reset_momentum()
 
+    def to(self, device: torch.device | str) -> PoseTable:
+        """A copy of the poses elsewhere, without what is remembered of past steps."""
+        betas = self.values["transl"].new_zeros(10)
+        return PoseTable(self.pose(betas).to(device))
+
     def reset_momentum(self) -> None:
         """Forget gradients of the past (a new stage, another resolution)."""
         self._first = {name: torch.zeros_like(value) for name, value in self.values.items()}

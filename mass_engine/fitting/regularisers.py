@@ -114,16 +114,22 @@ def depth_distortion_paper(distortion: Tensor, valid: Tensor) -> Tensor:
 
 
 def normal_consistency(
-    depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor, valid: Tensor, area: Tensor
+    depth: Tensor,
+    normal: Tensor,
+    alpha: Tensor,
+    K: Tensor,
+    valid: Tensor,
+    area: Tensor,
+    K_inverse: Tensor | None = None,
 ) -> Tensor:
     """sum_p (1 - N_p . n_p) / area (scalar): 2DGS's L_n (eq. 14).
 
     N is the rendered ``normal`` [h,w,3] (camera coordinates, sum of w n), n the normal of the surface that
     ``depth`` [h,w] describes (central differences of its points, towards the camera), times ``alpha`` [h,w]
     without gradient. ``K`` [3,3]. Only pixels count whose four neighbours show the surface too: across an
-    outline, or the picture's border, differences mean nothing.
+    outline, or the picture's border, differences mean nothing. ``K_inverse``: that of ``K``, if it is known.
     """
-    surface = depth_normals(depth, K)
+    surface = depth_normals(depth, K, K_inverse)
     shown = (alpha.detach() > 0.5) & (depth.detach() > 0)
     whole = torch.zeros_like(shown)
     whole[1:-1, 1:-1] = (
@@ -133,15 +139,16 @@ def normal_consistency(
     return (torch.where(whole, 1 - agreement, torch.zeros_like(agreement)) * valid).sum() / area
 
 
-def depth_normals(depth: Tensor, K: Tensor) -> Tensor:
+def depth_normals(depth: Tensor, K: Tensor, K_inverse: Tensor | None = None) -> Tensor:
     """Unit normals [h,w,3] towards the camera of the surface of ``depth`` [h,w], zero on the border."""
     height, width = depth.shape
-    x = torch.arange(width, dtype=depth.dtype) + 0.5
-    y = torch.arange(height, dtype=depth.dtype) + 0.5
+    x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
+    y = torch.arange(height, dtype=depth.dtype, device=depth.device) + 0.5
     pixels = torch.stack(
         [x.expand(height, width), y[:, None].expand(height, width), torch.ones_like(depth)], -1
     )
-    points = (pixels @ torch.linalg.inv(K).T.to(depth)) * depth.unsqueeze(-1)
+    inverse = torch.linalg.inv(K) if K_inverse is None else K_inverse
+    points = (pixels @ inverse.T.to(depth)) * depth.unsqueeze(-1)
     down = points[2:, 1:-1] - points[:-2, 1:-1]
     right = points[1:-1, 2:] - points[1:-1, :-2]
     across = torch.linalg.cross(down, right)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mass_engine.deform.network import Deformation, DeformationConfig, UnitCube
 from mass_engine.deform.residuals import deform
-from mass_engine.fitting.subject import PosedSurfels, Shape, pose_surfels
+from mass_engine.fitting.subject import PosedSurfels, Shape
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
 from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
@@ -37,6 +37,18 @@ class Skin:
         """Detached copies of the surfels ``sources`` [D] of the binding after the attached ones."""
         attached = self.sources[: self.detached_from]
         return Skin(self.binding, torch.cat([attached, sources]), len(attached))
+
+    def to(self, device: torch.device | str) -> Skin:
+        """The same surfels elsewhere, with a deformation of their own (themselves if they are there)."""
+        if self.sources.device == torch.device(device):
+            return self
+        moving = None if self.deformation is None else self.deformation.copied_to(device)
+        return Skin(self.binding.to(device), self.sources.to(device), self.detached_from, moving)
+
+    def take(self, other: Skin) -> None:
+        """The deformation's values in ``other``, the same surfels elsewhere."""
+        if other is not self and self.deformation is not None and other.deformation is not None:
+            self.deformation.load_tensors(other.deformation.tensors())
 
     @property
     def count(self) -> int:
@@ -83,8 +95,21 @@ class Skin:
     def pose(self, shape: Shape, pose: HandPose) -> PosedSurfels:
         """The surfels of a batch of poses [B]; differentiable in the deformation alone."""
         with torch.no_grad():
-            every = pose_surfels(shape, self.binding, pose)
-            surfels = every.attached
+            posed = shape.model.posed(pose, shape.displacement)
+            refined = self.binding.subdivision.apply(posed.vertices)
+            turns = posed.bone_transforms[..., :3, :3]
+        return self.on_mesh(refined, turns, posed.joints, pose.hand_pose, pose.betas)
+
+    def on_mesh(
+        self, refined: Tensor, bone_rotations: Tensor, joints: Tensor, hand_pose: Tensor, betas: Tensor
+    ) -> PosedSurfels:
+        """The surfels of posed refined meshes [B,V',3], whose bones and poses these are.
+
+        ``bone_rotations`` [B,16,3,3], ``joints`` [B,21,3], ``hand_pose`` [B,45], ``betas`` [B,10].
+        Differentiable in the deformation alone.
+        """
+        with torch.no_grad():
+            surfels = self.binding.register(refined)
             if self.count != self.binding.count or self.detached_from < self.count:
                 surfels = AttachedSurfels(
                     surfels.means[:, self.sources],
@@ -92,18 +117,18 @@ class Skin:
                     surfels.normals[:, self.sources],
                 )
         if self.deformation is None:
-            return PosedSurfels(surfels, every.outline_vertices, every.bone_rotations, every.joints)
+            return PosedSurfels(surfels, refined, bone_rotations, joints)
         start = self.detached_from
-        residuals = self.deformation(pose.hand_pose, pose.betas)
+        residuals = self.deformation(hand_pose, betas)
         parts = (surfels.means, surfels.tangents, surfels.normals)
         moved = deform(AttachedSurfels(*(part[:, start:] for part in parts)), residuals)
         both = zip(parts, (moved.means, moved.tangents, moved.normals), strict=True)
-        mask = torch.cat([torch.ones(len(residuals.mask), start), residuals.mask], 1)
+        mask = torch.cat([residuals.mask.new_ones(len(residuals.mask), start), residuals.mask], 1)
         return PosedSurfels(
             AttachedSurfels(*(torch.cat([part[:, :start], new], 1) for part, new in both)),
-            every.outline_vertices,
-            every.bone_rotations,
-            every.joints,
+            refined,
+            bone_rotations,
+            joints,
             mask,
             residuals,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -45,6 +45,12 @@ class Shape:
     betas: Tensor
     displacement: Tensor
 
+    def to(self, device: torch.device | str) -> Shape:
+        """The same shape elsewhere (itself if it is there)."""
+        if self.betas.device == torch.device(device):
+            return self
+        return Shape(self.model.to(device), self.betas.to(device), self.displacement.to(device))
+
     @staticmethod
     def mean(model: HandModel, betas: Tensor) -> Shape:
         """No displacement yet."""
@@ -60,6 +66,18 @@ class Appearance:
     opacity_logits: Tensor
     sh: Tensor
     light: Tensor
+
+    def to(self, device: torch.device | str) -> Appearance:
+        """The same look elsewhere (itself if it is there)."""
+        if self.albedo.device == torch.device(device):
+            return self
+        return Appearance(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+    def take(self, other: Appearance) -> None:
+        """The values of ``other``, wherever they are."""
+        if other is not self:
+            for field in fields(self):
+                getattr(self, field.name).copy_(getattr(other, field.name).detach())
 
     @staticmethod
     def plain(count: int, light: Tensor, harmonics: int = 0) -> Appearance:

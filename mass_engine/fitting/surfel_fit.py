@@ -3,63 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from mass_engine.deform.network import Deformation
-from mass_engine.fitting import losses, regularisers
+from mass_engine.device import Precision
 from mass_engine.fitting.evidence import Scene
-from mass_engine.fitting.guard import Guard
 from mass_engine.fitting.skin import Skin
-from mass_engine.fitting.subject import Appearance, PosedSurfels, render_row
-from mass_engine.fitting.views import Level
-from mass_engine.raster import RasterOptions, RenderOutput
+from mass_engine.fitting.static_pass import StaticSteps
+from mass_engine.fitting.subject import Appearance
+from mass_engine.fitting.surfel_loss import (
+    Frame,
+    render_frame,
+    shaped_options,
+    surfel_loss,
+)
+from mass_engine.fitting.surfel_loss import SurfelWeights as SurfelWeights
+from mass_engine.fitting.surfel_steps import DECAY, EagerSteps, Visit, groups_of
+from mass_engine.fitting.surfel_steps import SurfelPass as SurfelPass
 
-#: Learning rates: colour, logit, harmonic coefficients, light; of the deformation, tables and layers.
-RATES = {"albedo": 0.01, "opacity_logits": 0.03, "sh": 0.002, "light": 0.001}
-TABLE_RATE, LAYER_RATE = 0.01, 0.002
-#: The mask's place among the deformation's outputs.
-MASK = 8
 #: The validation frames' mean PSNR must rise by this much in a visit of all frames, or the pass ends, dB.
 LEAST_GAIN = 0.02
-#: What is left of the learning rates after each visit of all frames.
-DECAY = 0.4
-#: The hand's usual length, metres: the unit of depth distortion.
-HAND_SIZE = 0.18
-
-
-@dataclass(frozen=True)
-class SurfelPass:
-    """One resolution. ``visits`` of all frames at most; ``geometry`` moves the detached surfels, otherwise
-    their opacity mask is free; ``harmonics`` frees the view-dependent colour."""
-
-    side: int
-    visits: int
-    rate: float = 1.0
-    dssim: float = 0.2
-    geometry: bool = False
-    harmonics: bool = False
-
-    def folded(self) -> SurfelPass:
-        """One more visit at the rates the pass ends with."""
-        return replace(self, visits=1, rate=self.rate * DECAY ** (self.visits - 1))
-
-
-@dataclass(frozen=True)
-class SurfelWeights:
-    """What the terms weigh. ``binding`` names the loss; ``delta`` metres is how far a detached surfel may be
-    from its face for nothing; ``still`` holds the residuals (in their units) towards none."""
-
-    silhouette: float = 0.5
-    binding: str = "additive"
-    binding_weight: float = 1.0
-    delta: float = 5e-4
-    normal: float = 0.02
-    distortion: float = 10.0
-    still: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -86,12 +52,26 @@ def rounded(decibels: float) -> float | None:
 
 
 class SurfelFit:
-    """Passes over the rows of ``scene``; ``undone`` counts the steps that the guard took back."""
+    """Passes over the rows of ``scene``, where it is at work; ``undone`` counts the steps that the guard
+    took back.
 
-    def __init__(self, scene: Scene, weights: SurfelWeights | None = None, shading: bool = True) -> None:
-        self.scene = scene
+    ``static``: by steps of fixed shapes that do not wait for the device (None: on a GPU). ``precision`` of
+    the deformation's matrix products on a GPU.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        weights: SurfelWeights | None = None,
+        shading: bool = True,
+        static: bool | None = None,
+        precision: Precision = "float32",
+    ) -> None:
+        self.scene = scene.at_work()
+        self.static = self.scene.device.type == "cuda" if static is None else static
         self.weights = weights or SurfelWeights()
         self.shading = shading
+        self.precision = precision
         self.undone = 0
 
     def run(
@@ -107,34 +87,31 @@ class SurfelFit:
         validation says."""
         random = torch.Generator().manual_seed(seed)
         trained = rows or self.scene.trained
-        groups = list(_groups(skin, appearance, stage, self.shading))
+        given, (skin, appearance) = (skin, appearance), self._here(skin, appearance)
+        groups = list(groups_of(skin, appearance, stage, self.shading))
         parameters = [value for _, value in groups]
         for value in parameters:
             value.requires_grad_(True)
-        optimizer = torch.optim.Adam(
-            [{"params": [value], "lr": rate} for rate, value in groups], betas=(0.9, 0.98), eps=1e-15
-        )
-        guard = Guard(parameters)
+        steps = self._steps(skin, appearance, stage, groups, trained)
         before = latest = self.validation(skin, appearance, stage.side)
         visits = 1 if rows else stage.visits
         kept = [value.detach().clone() for value in parameters]
         visit = 0
         while visit < visits:
             order = torch.randperm(len(trained), generator=random).tolist()
-            for step, place in enumerate(order):
-                factor = stage.rate * guard.rate * DECAY ** (visit + step / len(order))
-                for group, (rate, _) in zip(optimizer.param_groups, groups, strict=True):
-                    group["lr"] = rate * factor
-                optimizer.zero_grad(set_to_none=True)
-                loss = self._loss(skin, appearance, stage, trained[place], random)
-                loss.backward()
-                if skin.deformation is not None:
-                    _freeze_part(skin.deformation, stage.geometry)
-                if guard.good(loss):
-                    optimizer.step()
+            plan = Visit(
+                [trained[place] for place in order],
+                [torch.rand(3, generator=random) for _ in order],
+                [stage.rate * DECAY ** (visit + step / len(order)) for step in range(len(order))],
+            )
+
+            def report(done: int, visit: int = visit, steps: int = len(order)) -> None:
                 if progress is not None:
-                    progress((visit + (step + 1) / len(order)) / visits)
+                    progress((visit + done / steps) / visits)
+
+            steps.visit(plan, report)
             visit += 1
+            _hand_back(given, (skin, appearance))
             reached = self.validation(skin, appearance, stage.side)
             if rows is None and reached < latest + LEAST_GAIN:
                 if reached < latest:
@@ -145,11 +122,37 @@ class SurfelFit:
                 break
             latest = reached
             kept = [value.detach().clone() for value in parameters]
-        self.undone += guard.undone
+        self.undone += steps.undone
         for value in parameters:
             value.requires_grad_(False)
             value.grad = None
+        _hand_back(given, (skin, appearance))
         return PassResult(visit, before, latest)
+
+    def _steps(
+        self,
+        skin: Skin,
+        appearance: Appearance,
+        stage: SurfelPass,
+        groups: list[tuple[float, Tensor]],
+        rows: list[int],
+    ) -> EagerSteps | StaticSteps:
+        if self.static:
+            return StaticSteps(self.scene, skin, appearance, stage, self.weights, groups, rows)
+
+        def loss(row: int, background: Tensor) -> Tensor:
+            options = self.scene.raster
+            if stage.shaped(self.weights):
+                depth = float(self.scene.table.values["transl"][row, 2].abs().clamp_min(0.05))
+                options = shaped_options(options, depth)
+            surfels = self.scene.surfels(skin, row)
+            frame, weights = self.frame(row, stage.side), self.weights
+            background = background.to(self.scene.device)
+            return surfel_loss(
+                appearance, skin, frame, surfels, background, options, weights, stage.dssim, stage.geometry
+            )[0]
+
+        return EagerSteps(skin, groups, stage.geometry, loss)
 
     def validation(self, skin: Skin, appearance: Appearance, side: int) -> float:
         """Mean PSNR of the validation frames (NaN: there are none), hand over black.
@@ -157,121 +160,35 @@ class SurfelFit:
         The error is summed over all valid pixels and divided by the hand's area: what sticks out costs as
         much as a hole. Inside the mask alone, a fatter hand would always be a better one.
         """
+        skin, appearance = self._here(skin, appearance)
         values = []
         for row in self.scene.validation:
             with torch.no_grad():
-                level = self.scene.views[row].level(side)
-                rgb = self._render(skin, appearance, level, row)[1]
+                frame = self.frame(row, side, windowed=False)
+                level, surfels = frame.level, self.scene.surfels(skin, row)
+                rgb = render_frame(appearance, skin.bones, frame, surfels, self.scene.raster)[1]
                 usable = torch.where(level.hand > 0.5, level.colored, level.valid)
                 squared = (rgb.clamp(0, 1) - level.rgb * level.hand.unsqueeze(-1)).square().mean(-1) * usable
                 area = (level.hand * level.colored).sum().clamp_min(1)
                 values.append(float(-10 * (squared.sum() / area).clamp_min(1e-8).log10()))
         return sum(values) / len(values) if values else float("nan")
 
-    def _render(
-        self,
-        skin: Skin,
-        appearance: Appearance,
-        level: Level,
-        row: int,
-        background: Tensor | None = None,
-        options: RasterOptions | None = None,
-    ) -> tuple[RenderOutput, Tensor, PosedSurfels]:
-        """The frame's hand before ``background``, its colours with the frame's gain, and the surfels."""
-        surfels = self.scene.surfels(skin, row)
-        out = render_row(
-            appearance, surfels, 0, skin.bones, level.camera, options or self.scene.raster, background
-        )
-        gain = self.scene.gains[row]
-        rgb = out.rgb
-        if bool((gain != 1).any()):
-            behind = torch.zeros(3) if background is None else background
-            through = (1 - out.alpha).unsqueeze(-1) * behind
-            rgb = (rgb - through) * gain + through
-        return out, rgb, surfels
+    def _here(self, skin: Skin, appearance: Appearance) -> tuple[Skin, Appearance]:
+        """Where the scene is (themselves if they are there)."""
+        skin, appearance = skin.to(self.scene.device), appearance.to(self.scene.device)
+        if skin.deformation is not None and self.scene.device.type == "cuda":
+            skin.deformation.precision = self.precision
+        return skin, appearance
 
-    def _loss(
-        self, skin: Skin, appearance: Appearance, stage: SurfelPass, row: int, random: torch.Generator
-    ) -> Tensor:
-        w = self.weights
-        level = self.scene.views[row].level(stage.side)
-        background = torch.rand(3, generator=random)
-        shaped = stage.geometry and (w.normal > 0 or w.distortion > 0)
-        options = self._shaped_options(row) if shaped else None
-        out, rgb, surfels = self._render(skin, appearance, level, row, background, options)
-        area = level.hand.sum().clamp_min(16.0)
-        cover = level.hand.unsqueeze(-1)
-        target = level.rgb * cover + background * (1 - cover)
-        loss = losses.photometric(rgb, target, level.colored, area)
-        if stage.dssim > 0:
-            inside = level.colored * (level.hand > 0)
-            window = level.hand_window()
-            structure = losses.dssim(rgb[window], target[window], inside[window])
-            loss = (1 - stage.dssim) * loss + stage.dssim * 2 * structure
-        loss = loss + w.silhouette * losses.silhouette(out.alpha, level.hand, level.valid, area, holes=0.0)
-        if not stage.geometry:
-            return loss
-        if options is not None:
-            depth = self.scene.table.values["transl"][row, 2]
-            loss = loss + w.distortion * regularisers.depth_distortion(
-                out.distortion, level.valid, area, options, depth, HAND_SIZE
-            )
-            loss = loss + w.normal * regularisers.normal_consistency(
-                out.median_depth, out.normal, out.alpha, level.camera.K, level.valid, area
-            )
-        return loss + self._held(skin, surfels)
-
-    def _held(self, skin: Skin, surfels: PosedSurfels) -> Tensor:
-        """What binds the detached surfels to the mesh."""
-        w = self.weights
-        if surfels.residuals is None:
-            return torch.zeros(())
-        attached, start = surfels.attached, skin.detached_from
-        means, normals = attached.means[:, start:], attached.normals[:, start:]
-        residuals = surfels.residuals
-        config = skin.deformation.config if skin.deformation is not None else None
-        assert config is not None
-        still = (residuals.offset / config.offset_unit).square().mean() + residuals.log_scale.square().mean()
-        loss = w.still * (still + (residuals.rotation / config.rotation_unit).square().mean())
-        if w.binding == "none":
-            return loss * 0.0
-        triangles = skin.triangles(surfels.outline_vertices)
-        if w.binding == "paper":
-            return loss + w.binding_weight * regularisers.binding_paper(means, normals, triangles, w.delta)
-        return loss + w.binding_weight * regularisers.binding_additive(means, normals, triangles, w.delta)
-
-    def _shaped_options(self, row: int) -> RasterOptions:
-        depth = float(self.scene.table.values["transl"][row, 2].abs().clamp_min(0.05))
-        return RasterOptions(
-            outputs="all",
-            cull_backfaces=self.scene.raster.cull_backfaces,
-            distortion_range=(0.5 * depth, 2.0 * depth),
-        )
+    def frame(self, row: int, side: int, windowed: bool = True) -> Frame:
+        """One row's frame where the scene is; ``windowed``: with the window around the hand."""
+        level, gain = self.scene.level(row, side), self.scene.gains[row]
+        depth = self.scene.table.values["transl"][row, 2]
+        window = level.hand_window() if windowed else None
+        return Frame(level, depth, gain if bool((gain != 1).any()) else None, window)
 
 
-def _groups(
-    skin: Skin, appearance: Appearance, stage: SurfelPass, shading: bool
-) -> Iterator[tuple[float, Tensor]]:
-    """Learning rate and tensor of everything that the pass moves."""
-    names = ["albedo", "opacity_logits"] + (["light"] if shading else [])
-    if stage.harmonics and appearance.sh.shape[1] > 0:
-        names.append("sh")
-    for name in names:
-        yield RATES[name], getattr(appearance, name)
-    moving = skin.deformation
-    if moving is None:
-        return
-    if stage.geometry:
-        for name, value in moving.named_parameters():
-            yield (TABLE_RATE if "table" in name else LAYER_RATE), value
-    else:
-        yield LAYER_RATE, moving.head
-        yield LAYER_RATE, moving.head_bias
-
-
-def _freeze_part(moving: Deformation, geometry: bool) -> None:
-    """Take away the gradient of the mask (stage one) or of everything but the mask (stage two)."""
-    frozen = slice(MASK, MASK + 1) if geometry else slice(0, MASK)
-    for value in (moving.head, moving.head_bias):
-        if value.grad is not None:
-            value.grad[..., frozen] = 0
+def _hand_back(given: tuple[Skin, Appearance], here: tuple[Skin, Appearance]) -> None:
+    """What a pass has reached, to where its caller has it."""
+    given[0].take(here[0])
+    given[1].take(here[1])

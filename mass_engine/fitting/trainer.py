@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mass_engine.avatar import Avatar, SourceFrames
 from mass_engine.camera import Camera
+from mass_engine.device import Precision
 from mass_engine.fitting.components import Components
 from mass_engine.fitting.conversion import convert, deform_surfels, finish
 from mass_engine.fitting.evidence import Evidence, Scene, colors_of, fill_unseen, gather, spread
@@ -61,7 +62,11 @@ class FitResult:
 
 @dataclass
 class Trainer:
-    """Runs the steps of a schedule over one state; between two steps the state is all there is."""
+    """Runs the steps of a schedule over one state; between two steps the state is all there is.
+
+    The state is always on the CPU, and so is the registration, whose solver and contours are NumPy's and
+    OpenCV's. Passes that draw surfels to gather their colours, or that move surfels, run on ``device``.
+    """
 
     views: list[View]
     state: FitState
@@ -71,6 +76,8 @@ class Trainer:
     seed: int
     start: HandPose
     show: Show | None = None
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    precision: Precision = "float32"
     _bindings: dict[tuple[int, int, bool], MeshBinding] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -84,7 +91,9 @@ class Trainer:
         every = self.schedule.validate_every
         # Too few frames to give any away: then nothing is validated, and nothing stops early.
         validation = trained[every // 2 :: every] if len(trained) >= 3 * every else []
-        self.scene = Scene(self.views, state.table, state.shape, self.raster, state.gains, validation)
+        self.scene = Scene(
+            self.views, state.table, state.shape, self.raster, state.gains, validation, self.device
+        )
 
     def bind(self, levels: int, depth: int, widened: bool = False) -> MeshBinding:
         """A binding of the hand's mesh (kept for the next call)."""
@@ -229,7 +238,7 @@ class Trainer:
 
     def _fitter(self) -> SurfelFit:
         weights = SurfelWeights(binding=self.components.binding)
-        return SurfelFit(self.scene, weights, self.components.shading)
+        return SurfelFit(self.scene, weights, self.components.shading, precision=self.precision)
 
     def _deform(self, progress: Progressed) -> None:
         fitter = self._fitter()
@@ -282,6 +291,8 @@ def fit_hand(
     components: Components | None = None,
     checkpoint: Path | None = None,
     show: Show | None = None,
+    device: torch.device | None = None,
+    precision: Precision = "float32",
 ) -> FitResult:
     """Fit one hand to ``views`` (in time order) from the poses ``start`` [F] with one shape.
 
@@ -290,6 +301,7 @@ def fit_hand(
     Held-out views give only their silhouette and landmarks, only to their own pose, and only after
     everything else is finished. With a ``checkpoint`` file every step is saved there; if the file holds
     steps of the same fit, it goes on after them, with the same result as if it had never stopped.
+    ``device``: where passes over the surfels run (None: the CPU), with which ``precision`` on a GPU.
     """
     torch.manual_seed(seed)
     components = components or Components()
@@ -299,7 +311,8 @@ def fit_hand(
     state = FitState(
         PoseTable(start), Shape.mean(model, start.betas[0]), white_light(), torch.ones(len(views), 3)
     )
-    trainer = Trainer(views, state, camera, schedule, components, seed, start, show)
+    device = device or torch.device("cpu")
+    trainer = Trainer(views, state, camera, schedule, components, seed, start, show, device, precision)
     state.notes["start_jitter_radians"] = round(noise, 4)
     with one_thread():  # thousands of small operators; the rasteriser has threads of its own
         trainer.run(progress, checkpoint)

@@ -32,6 +32,16 @@ class Level:
     colored: Tensor
     camera: Camera
 
+    def to(self, device: torch.device | str) -> Level:
+        """The same elsewhere."""
+        return Level(
+            self.rgb.to(device),
+            self.hand.to(device),
+            self.valid.to(device),
+            self.colored.to(device),
+            self.camera.to(device),
+        )
+
     def hand_window(self) -> tuple[slice, slice]:
         """Rows and columns of the hand's bounding box, a few pixels wider."""
         rows, columns = self.hand.amax(1).nonzero(), self.hand.amax(0).nonzero()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -13,11 +14,11 @@ from mass_engine.errors import EngineError
 from mass_engine.hand.pose import TIP_PARENTS, HandPose, Side
 from mass_engine.hand.rotation import axis_angle_to_matrix as axis_angle_to_matrix
 
-_KNUCKLES = [1, 4, 7, 10, 13]
-_MIDDLE = [2, 5, 8, 11, 14]
-_LAST = [3, 6, 9, 12, 15]
+_KNUCKLES = (1, 4, 7, 10, 13)
+_MIDDLE = (2, 5, 8, 11, 14)
+_LAST = (3, 6, 9, 12, 15)
 #: Chain order (three levels of five) back to joint order.
-_FROM_LEVELS = [0, 1, 6, 11, 2, 7, 12, 3, 8, 13, 4, 9, 14, 5, 10, 15]
+_FROM_LEVELS = (0, 1, 6, 11, 2, 7, 12, 3, 8, 13, 4, 9, 14, 5, 10, 15)
 
 _REQUIRED = (
     "template", "faces", "shape_basis", "joint_template", "joint_shape_basis", "weights",
@@ -104,7 +105,9 @@ class HandModel:
             shaped = shaped + offsets
         rotations = _local_rotations(pose)
         if self.pose_basis is not None:
-            bend = (rotations[..., 1:, :, :] - torch.eye(3).to(rotations)).flatten(-3)
+            bend = (
+                rotations[..., 1:, :, :] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+            ).flatten(-3)
             shaped = shaped + _combine(self.pose_basis, bend)
         turns, places = _chain(rotations, rest)
         shifts = places - (turns @ rest[..., :16, :].unsqueeze(-1)).squeeze(-1) + pose.transl.unsqueeze(-2)
@@ -113,7 +116,9 @@ class HandModel:
         turned = (turn * shaped.unsqueeze(-2)).sum(-1)
         points = _points(turns, places, rest) + pose.transl.unsqueeze(-2)
         upper = torch.cat((turns, shifts.unsqueeze(-1)), -1)
-        lower = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(upper).expand(*upper.shape[:-2], 1, 4)
+        lower = upper.new_zeros(4)
+        lower[3] = 1.0
+        lower = lower.expand(*upper.shape[:-2], 1, 4)
         return PosedHand(turned + blended[..., 9:], points, torch.cat((upper, lower), -2))
 
     def mirrored(self) -> HandModel:
@@ -186,25 +191,34 @@ def _local_rotations(pose: HandPose) -> Tensor:
     return axis_angle_to_matrix(vectors.reshape(*vectors.shape[:-1], 16, 3))
 
 
+@functools.cache
+def _index(joints: tuple[int, ...], device: torch.device) -> Tensor:
+    """Made once: indexing with a list copies it to the device each time, which waits for the device."""
+    return torch.tensor(joints, device=device)
+
+
 def _chain(rotations: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
     """Absolute rotations [...,16,3,3] and joint places [...,16,3]; all five fingers a level at a time."""
     lead: tuple[int, ...] = np.broadcast_shapes(rotations.shape[:-3], rest.shape[:-2])
     turn = rotations[..., :1, :, :].expand(*lead, 1, 3, 3)
     place = rest[..., :1, :].expand(*lead, 1, 3)
     turns, places = [turn], [place]
-    parents: list[list[int]] = [[0], _KNUCKLES, _MIDDLE]
-    for level, parent in zip((_KNUCKLES, _MIDDLE, _LAST), parents, strict=True):
+    device = rest.device
+    knuckles, middle, last = (_index(level, device) for level in (_KNUCKLES, _MIDDLE, _LAST))
+    parents = [_index((0,), device), knuckles, middle]
+    for level, parent in zip((knuckles, middle, last), parents, strict=True):
         step = rest[..., level, :] - rest[..., parent, :]
         place = place + (turn @ step.unsqueeze(-1)).squeeze(-1)
         turn = turn @ rotations[..., level, :, :]
         turns.append(turn)
         places.append(place)
-    return torch.cat(turns, -3)[..., _FROM_LEVELS, :, :], torch.cat(places, -2)[..., _FROM_LEVELS, :]
+    order = _index(_FROM_LEVELS, device)
+    return torch.cat(turns, -3)[..., order, :, :], torch.cat(places, -2)[..., order, :]
 
 
 def _points(turns: Tensor, places: Tensor, rest: Tensor) -> Tensor:
     """The 16 joints and 5 fingertips [...,21,3]."""
-    parent = list(TIP_PARENTS)
+    parent = _index(TIP_PARENTS, rest.device)
     arm = (rest[..., 16:, :] - rest[..., parent, :]).unsqueeze(-1)
     tips = places[..., parent, :] + (turns[..., parent, :, :] @ arm).squeeze(-1)
     return torch.cat((places, tips), -2)

@@ -44,6 +44,16 @@ class HandPose:
     transl: Tensor
     side: Side = "right"
 
+    def to(self, device: torch.device | str) -> HandPose:
+        """The same pose elsewhere."""
+        return HandPose(
+            self.betas.to(device),
+            self.global_orient.to(device),
+            self.hand_pose.to(device),
+            self.transl.to(device),
+            self.side,
+        )
+
     @staticmethod
     def rest(side: Side = "right") -> HandPose:
         """The flat hand at the origin with the mean shape."""

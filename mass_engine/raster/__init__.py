@@ -1,7 +1,7 @@
 """2-D Gaussian surfel rasteriser (2DGS, Huang et al. 2024), exact and differentiable.
 
-``rasterize`` is the whole interface. Two implementations stand behind it: ``reference`` (plain torch, any
-dtype, the specification) and ``cpu`` (C++ kernels).
+``rasterize`` is the whole interface. Three implementations stand behind it: ``reference`` (plain torch, any
+dtype, the specification), ``cpu`` (C++ kernels) and ``cuda`` (the same mathematics on a GPU).
 
 Conventions: a surfel is a centre and two tangents, conjugate half-diameters of its one-sigma ellipse; the
 product of the tangents points out of its front (``surfel.inellipse.principal_tangents`` makes them of
@@ -15,8 +15,8 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.errors import BadArgumentError
-from mass_engine.raster import cpu, reference
-from mass_engine.raster.types import Extras, RasterOptions, RenderOutput
+from mass_engine.raster import cpu, cuda, reference
+from mass_engine.raster.types import Backend, Extras, RasterOptions, RenderOutput
 
 __all__ = ["Extras", "RasterOptions", "RenderOutput", "rasterize"]
 
@@ -39,17 +39,19 @@ def rasterize(
     ``colors`` are plain [N,3] or spherical harmonics [N,K,3] of degree 0 to 3 (K = 1, 4, 9 or 16), seen from
     the camera's centre: max(0, 0.5 + sum_k Y_k h_k). ``background`` [3] or [H,W,3] goes behind (none: black,
     so ``rgb`` is premultiplied). Gradients reach every tensor argument and ``camera.world_to_camera`` (taken
-    as a rigid motion) and ``camera.K`` (its upper two rows; the third is taken as 0, 0, 1). The "cpu" backend
-    computes in float32 and is deterministic bit for bit whatever the number of threads. Raises
-    ``BadArgumentError`` (``raster.shape``, ``raster.device``, ``raster.image_size``, ...).
+    as a rigid motion) and ``camera.K`` (its upper two rows; the third is taken as 0, 0, 1). Surfels are
+    rendered where they are, on the CPU or a GPU; the camera may stay on the CPU. Both compute in float32, the
+    same bits every time, whatever the number of threads. Raises ``BadArgumentError`` (``raster.shape``,
+    ``raster.device``, ``raster.image_size``, ...) and ``EngineError`` (``device.unavailable``,
+    ``raster.too_many_pairs``).
     """
     options = options or RasterOptions()
     options.check()
     _check(means, tangents, opacities, colors, camera)
+    backend = _backend(means, tangents, opacities, colors, camera, options.backend)
     if options.window is not None:
         camera = _window(camera, *options.window)
-    render = reference.rasterize if options.backend == "reference" else cpu.rasterize
-    out = render(means, tangents, opacities, colors, camera, options)
+    out = _RENDER[backend](means, tangents, opacities, colors, camera, options)
     if background is None:
         return out
     if background.shape not in ((3,), (camera.height, camera.width, 3)):
@@ -57,7 +59,28 @@ def rasterize(
             "raster.shape", f"background is {tuple(background.shape)}.", "Give [3] or [height, width, 3]."
         )
     rgb = out.rgb + (1.0 - out.alpha)[..., None] * background
-    return RenderOutput(rgb, out.alpha, out.depth, out.dropped, out.extras)
+    return RenderOutput(rgb, out.alpha, out.depth, out.dropped, out.extras, out.counters)
+
+
+_RENDER = {"cpu": cpu.rasterize, "cuda": cuda.rasterize, "reference": reference.rasterize}
+
+
+def _backend(
+    means: Tensor, tangents: Tensor, opacities: Tensor, colors: Tensor, camera: Camera, asked: Backend
+) -> Backend:
+    """The one that ``auto`` is; raise unless all tensors are where it computes."""
+    backend: Backend = asked if asked != "auto" else "cuda" if means.device.type == "cuda" else "cpu"
+    surfels = {"means": means, "tangents": tangents, "opacities": opacities, "colors": colors}
+    cameras = {"camera.K": camera.K, "camera.world_to_camera": camera.world_to_camera}
+    wanted = means.device if backend == "cuda" and means.device.type == "cuda" else None
+    for name, tensor in (surfels | cameras).items():
+        here = tensor.device
+        if here.type == "cpu" and (backend != "cuda" or name in cameras):
+            continue
+        if wanted is None or here != wanted:
+            place = wanted or ("a GPU" if backend == "cuda" else "the CPU")
+            raise BadArgumentError("raster.device", f"{name} is on {here}.", f"Move it to {place}.")
+    return backend
 
 
 def _window(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
@@ -92,9 +115,9 @@ def _check(means: Tensor, tangents: Tensor, opacities: Tensor, colors: Tensor, c
             raise BadArgumentError(
                 "raster.dtype", f"{name} is {tensor.dtype}.", "Give floating-point tensors."
             )
-        if tensor.device.type != "cpu":
-            raise BadArgumentError("raster.device", f"{name} is on {tensor.device}.", "Move it to the CPU.")
-    if not bool(camera.K.isfinite().all()) or not bool(camera.world_to_camera.isfinite().all()):
+    # On a GPU the kernels look, so that nothing waits for it here.
+    on_cpu = [t for t in (camera.K, camera.world_to_camera) if t.device.type == "cpu"]
+    if not all(bool(t.isfinite().all()) for t in on_cpu):
         raise BadArgumentError(
             "raster.camera", "The camera holds NaN or infinity.", "Check K and world_to_camera."
         )

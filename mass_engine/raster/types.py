@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mass_engine.errors import BadArgumentError
 
-Backend = Literal["auto", "cpu", "reference"]
+Backend = Literal["auto", "cpu", "cuda", "reference"]
 Outputs = Literal["color", "all"]
 Convention = Literal["exact", "inria", "gsplat"]
 InstructionSet = Literal["auto", "avx512", "avx2", "portable", "scalar"]
@@ -47,6 +47,9 @@ class RasterOptions:
     deviations, "gsplat" around 3.33 of them, and gives every pixel of a surfel its centre's depth.
     ``threads``: None is every core this process may use. ``instruction_set`` and ``without`` (optimisations
     of the "cpu" backend to leave out) do not change the image: they are there to measure.
+    ``pair_capacity``: room for pairs of surfel and 16-pixel tile in the "cuda" backend's memory. None: as
+    many as the frame needs, for which the host waits. A number: nothing waits, and a frame that needs more
+    lacks surfels (``raster.cuda.check_counters``).
     """
 
     backend: Backend = "auto"
@@ -59,6 +62,7 @@ class RasterOptions:
     threads: int | None = None
     instruction_set: InstructionSet = "auto"
     without: frozenset[Optimization] = frozenset()
+    pair_capacity: int | None = None
 
     def check(self) -> None:
         """Raise ``BadArgumentError`` when a value makes no sense."""
@@ -78,6 +82,12 @@ class RasterOptions:
             )
         if self.threads is not None and self.threads < 1:
             raise BadArgumentError("raster.threads", f"threads is {self.threads}.", "Give at least 1.")
+        if self.pair_capacity is not None and not 0 < self.pair_capacity < 1 << 31:
+            raise BadArgumentError(
+                "raster.pair_capacity",
+                f"pair_capacity is {self.pair_capacity}.",
+                "Give a number from 1 to 2147483647.",
+            )
 
     @property
     def near_plane(self) -> float:
@@ -124,6 +134,8 @@ class RenderOutput:
     camera coordinates, each n turned to the camera; ``distortion`` [H,W] sum over pairs of w_i w_j (m_i -
     m_j)^2; ``weight_sum`` [N] sum of each surfel's blending weights over the image (no gradient; 0 is not
     visible).
+    On a GPU with ``pair_capacity`` nobody waited for the count: ``dropped`` is -1, and ``counters`` [3] are
+    on the device, for ``raster.cuda.check_counters``.
     """
 
     rgb: Tensor
@@ -131,6 +143,7 @@ class RenderOutput:
     depth: Tensor
     dropped: int
     extras: Extras | None = None
+    counters: Tensor | None = None
 
     def _extras(self) -> Extras:
         if self.extras is None:

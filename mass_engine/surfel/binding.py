@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -86,6 +86,19 @@ class MeshBinding:
             bones.repeat_interleave(count),
             widened,
             parts,
+        )
+
+    def to(self, device: torch.device | str) -> MeshBinding:
+        """The same elsewhere."""
+        if self.bones.device == torch.device(device):
+            return self
+        return replace(
+            self,
+            base_faces=self.base_faces.to(device),
+            subdivision=self.subdivision.to(device),
+            surfel_faces=self.surfel_faces.to(device),
+            bones=self.bones.to(device),
+            _parts=self._parts.to(device),
         )
 
     @property

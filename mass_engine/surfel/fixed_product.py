@@ -10,6 +10,8 @@ import scipy.sparse as sp
 import torch
 from torch import Tensor
 
+from mass_engine import gpu
+
 
 def fixed_product(matrix: Tensor, transpose: Tensor, dense: Tensor) -> Tensor:
     """``matrix`` [N,T] (CSR) @ ``dense`` [T,C] -> [N,C].
@@ -24,11 +26,16 @@ class _FixedProduct(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, dense: Tensor, matrix: Tensor, transpose: Tensor) -> Tensor:
         ctx.transpose = transpose
-        return torch.mm(matrix, dense)
+        return _product(matrix, dense)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        return torch.mm(ctx.transpose, gradient), None, None
+        return _product(ctx.transpose, gradient), None, None
+
+
+def _product(matrix: Tensor, dense: Tensor) -> Tensor:
+    kernels = gpu.kernels_for(dense)
+    return torch.mm(matrix, dense) if kernels is None else gpu.sparse_product(kernels, matrix, dense)
 
 
 def to_torch_csr(matrix: sp.csr_array) -> Tensor:

@@ -58,8 +58,8 @@ def evaluate_sh(sh: Tensor, directions: Tensor) -> Tensor:
 
 
 def evaluate_sh_rest(sh: Tensor, directions: Tensor) -> Tensor:
-    """What degrees 1 and up add to a colour: ``sh`` [N,K-1,3] without its constant term -> [N,3]."""
-    return torch.einsum("nk,nkc->nc", sh_basis(directions, sh.shape[1] + 1)[..., 1:], sh)
+    """What degrees 1 and up add to a colour: ``sh`` [N,K-1,3] without its constant term -> [...,N,3]."""
+    return torch.einsum("...nk,nkc->...nc", sh_basis(directions, sh.shape[1] + 1)[..., 1:], sh)
 
 
 def rgb_to_sh0(rgb: Tensor) -> Tensor:

@@ -33,6 +33,16 @@ class Subdivision:
         product = fixed_product(self._matrix, self._transpose, columns)
         return product.reshape(self.n_vertices, -1, channels).movedim(0, 1).reshape(*lead, -1, channels)
 
+    def to(self, device: torch.device | str) -> Subdivision:
+        """The same elsewhere."""
+        return Subdivision(
+            self.faces.to(device),
+            self.face_parent.to(device),
+            self.n_vertices,
+            None if self._matrix is None else self._matrix.to(device),
+            None if self._transpose is None else self._transpose.to(device),
+        )
+
     def gather(self, values: Tensor) -> Tensor:
         """The transposed map: values [V',C] of the refined mesh summed onto the base vertices [V,C]."""
         return values if self._transpose is None else torch.mm(self._transpose, values)

@@ -87,6 +87,18 @@ def main() -> int:
         case "arguments":
             say(type="error", code="options.seed", message="The seed is bad.", advice="Use another.")
             return 2
+        case "no_device":
+            say(type="error", code="device.unavailable", message="There is no GPU.", advice="Use the CPU.")
+            return 2
+        case "device_memory":  # enough of it only for some presets and so many frames
+            setting = f"{options.preset}/{options.max_frames}"
+            note(plan, f"setting:{setting}", run)
+            (run / "checkpoint").mkdir(exist_ok=True)
+            (run / "checkpoint" / "state.json").write_text("{}")
+            say(type="warning", code="video.dark", message="The clip is dark.", advice="Use more light.")
+            if setting not in plan["suffices"]:
+                say(type="error", code="device.out_of_memory", message="Full.", advice="Use less.")
+                return 5
         case "empty":
             return 0
         case "steps":

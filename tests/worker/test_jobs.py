@@ -77,6 +77,13 @@ def test_arguments_the_engine_refuses_are_not_tried_again(running: Bench) -> Non
     assert len(running.starts(job_id)) == 1
 
 
+def test_a_gpu_that_is_not_there_is_named_and_not_looked_for_again(running: Bench) -> None:
+    job_id = running.submit("no_device", options={"device": "cuda"})
+    job = running.until(job_id, "failed")
+    assert (job.error_code, job.error_message) == ("device.unavailable", "There is no GPU.")
+    assert len(running.starts(job_id)) == 1
+
+
 def test_an_unknown_option_in_the_row_never_reaches_the_engine(running: Bench) -> None:
     job_id = running.job(options={"out": "/etc"})
     running.publish(job_id)
@@ -165,3 +172,35 @@ def test_the_health_command_tells_a_live_worker_from_none(running: Bench) -> Non
 def test_a_message_about_no_job_is_dropped(running: Bench) -> None:
     running.queue.publish("no-such-job")
     running.until(running.submit(), "succeeded")
+
+
+def test_a_full_gpu_is_tried_again_at_a_smaller_setting_and_the_owner_is_told(running: Bench) -> None:
+    job_id = running.submit("device_memory", options={"preset": "full"}, suffices=["draft/None"])
+    job = running.until(job_id, "succeeded")
+    settings = [word for word in running.words(job_id) if word.startswith("setting:")]
+    assert settings == ["setting:full/None", "setting:auto/None", "setting:draft/None"]
+    # Three runs, each a process of its own, in one attempt; later ones may go on from the checkpoint.
+    assert (job.attempt, len({*running.starts(job_id)})) == (1, 3)
+    assert running.words(job_id).count("resume") == 2
+    assert job.options == {"preset": "full"}
+    assert [warning["code"] for warning in job.warnings] == [
+        "video.dark",
+        "device.smaller_setting",
+        "device.smaller_setting",
+    ]
+    assert "draft" in job.warnings[-1]["message"]
+    said = [line.text for line in running.store.logs(job_id)]
+    assert said.count("error device.out_of_memory: Full.") == 2
+    assert [line for line in said if "device.smaller_setting" in line and "preset auto" in line]
+
+
+def test_a_gpu_that_is_always_full_fails_the_job_after_two_smaller_settings(running: Bench) -> None:
+    job_id = running.submit("device_memory", options={"preset": "draft"}, suffices=[])
+    job = running.until(job_id, "failed")
+    settings = [word for word in running.words(job_id) if word.startswith("setting:")]
+    assert settings == ["setting:draft/None", "setting:draft/80", "setting:draft/40"]
+    assert (job.attempt, job.error_code) == (1, "device.out_of_memory")
+    assert job.error_message is not None
+    assert "80 frames" in job.error_message
+    assert "40 frames" in job.error_message
+    assert "cpu" in (job.error_advice or "")

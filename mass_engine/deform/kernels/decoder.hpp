@@ -2,13 +2,12 @@
 // pass computes them again.
 #pragma once
 
+#include "decoder_outputs.hpp"
 #include "decoder_types.hpp"
 #include "layers.hpp"
 #include "vectors.hpp"
 
 namespace mass::MASS_ISA {
-
-MASS_INLINE F relu(F x) { return max(x, splat(0.0f)); }
 
 // hidden[rows, H] = relu(share + pose); rows beyond `count` are zero, to the end of a block.
 MASS_INLINE void first_layer(const float* share, const float* pose, int count, int hidden, float* out) {
@@ -33,27 +32,9 @@ MASS_INLINE void decode_block(const DecoderData& d, int b, int first, int count,
             [&](int row, int column, F x) { store(out + row * kPaddedOutputs + column, x); });
 }
 
-inline constexpr float kLog2 = 0.69314718f;
-
-MASS_INLINE F tanh_of(F x) {
-    const F q = exp_neg(mul(splat(-2.0f), abs(x))), one = splat(1.0f);
-    const F t = div(sub(one, q), add(one, q));
-    return select(lt(x, splat(0.0f)), neg(t), t);
-}
-
 // Residuals of sixteen surfels from the decoder's outputs [16 surfels,16].
-struct Outputs {
-    F offset[3], log_scale[2], rotation[3], mask_logit;
-};
-
 MASS_INLINE Outputs residuals_of(const DecoderData& d, const float* block) {
-    const auto output = [&](int k) { return gather(block + k, kPaddedOutputs); };
-    Outputs o;
-    for (int k = 0; k < 3; ++k) o.offset[k] = mul(splat(d.offset_unit), output(k));
-    for (int k = 0; k < 2; ++k) o.log_scale[k] = mul(splat(kLog2), tanh_of(output(3 + k)));
-    for (int k = 0; k < 3; ++k) o.rotation[k] = mul(splat(d.rotation_unit), output(5 + k));
-    o.mask_logit = output(8);
-    return o;
+    return residuals_of(d.offset_unit, d.rotation_unit, [&](int k) { return gather(block + k, kPaddedOutputs); });
 }
 
 // Surfels [begin, end) in every pose.
@@ -91,12 +72,7 @@ MASS_INLINE void output_gradients(const DecoderData& d, const ResidualRowGradien
         load_rows<3>(g.rotation + 3 * here, count, out + 5);
         load_rows<1>(g.mask_logit + here, count, out + 8);
         load_rows<2>(g.log_scale_value + 2 * here, count, log_scale);
-        for (int k = 0; k < 3; ++k) out[k] = mul(splat(d.offset_unit), out[k]);
-        for (int k = 0; k < 2; ++k) {
-            const F slope = fnma(mul(log_scale[k], log_scale[k]), splat(1.0f / kLog2), splat(kLog2));
-            out[3 + k] = mul(slope, out[3 + k]);
-        }
-        for (int k = 0; k < 3; ++k) out[5 + k] = mul(splat(d.rotation_unit), out[5 + k]);
+        differentiate_outputs(d.offset_unit, d.rotation_unit, log_scale, out);
         interleave<kOutputs>(out, kLanes, block + row * kOutputs);
     }
 }

@@ -88,7 +88,7 @@ MASS_INLINE Change load_change(const ResidualData& d, int row, int count) {
 }
 
 // Rows [begin, end) of flattened batches.
-inline void deform(const ResidualData& d, float* means, float* tangents, float* normals, int begin, int end) {
+MASS_ENTRY void deform(const ResidualData& d, float* means, float* tangents, float* normals, int begin, int end) {
     for (int row = begin; row < end; row += kLanes) {
         const int count = end - row < kLanes ? end - row : kLanes;
         V3 mean, pair[2], normal;
@@ -103,7 +103,7 @@ inline void deform(const ResidualData& d, float* means, float* tangents, float* 
 }
 
 // The gradient of the means passes unchanged; those of the rest of rows [begin, end).
-inline void deform_backward(const ResidualData& d, const ResidualGradient& g, int begin, int end) {
+MASS_ENTRY void deform_backward(const ResidualData& d, const ResidualGradient& g, int begin, int end) {
     for (int row = begin; row < end; row += kLanes) {
         const int count = end - row < kLanes ? end - row : kLanes;
         V3 pair[2], normal, Gm, G[2], Gn;

@@ -26,6 +26,21 @@ MASS_INLINE F exp_any(F x) {
     return select(lt(x, splat(0.0f)), e, div(splat(1.0f), e));
 }
 
+#if MASS_WIDTH == 0
+
+// One lane is one row.
+template <int width>
+MASS_INLINE void load_rows(const float* in, int, F* values) {
+    for (int k = 0; k < width; ++k) values[k] = in[k];
+}
+
+template <int width>
+MASS_INLINE void interleave(const F* values, int, float* out) {
+    for (int k = 0; k < width; ++k) out[k] = values[k];
+}
+
+#else
+
 // Lanes of `values[width]` = in[row, width] of the first `count` rows; lanes beyond are zero.
 template <int width>
 MASS_INLINE void load_rows(const float* in, int count, F* values) {
@@ -53,5 +68,7 @@ MASS_INLINE void interleave(const F* values, int count, float* out) {
         }
     }
 }
+
+#endif
 
 }  // namespace mass::MASS_ISA

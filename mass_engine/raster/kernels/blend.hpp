@@ -1,25 +1,11 @@
 // Front to back over one tile: the forward pass.
 #pragma once
 
+#include "blend_pixels.hpp"
 #include "reduce.hpp"
-#include "sample.hpp"
+#include "tile_blocks.hpp"
 
 namespace mass::MASS_ISA {
-
-struct alignas(64) TileForward {
-    float transmittance[kBlocksPerTile][kLanes];  // negative once the pixel has ended
-    float r[kBlocksPerTile][kLanes], g[kBlocksPerTile][kLanes], b[kBlocksPerTile][kLanes];
-    float depth[kBlocksPerTile][kLanes];
-    float stop[kBlocksPerTile][kLanes];
-};
-
-struct alignas(64) TileForwardExtra {
-    float median[kBlocksPerTile][kLanes], median_rank[kBlocksPerTile][kLanes];
-    float nx[kBlocksPerTile][kLanes], ny[kBlocksPerTile][kLanes], nz[kBlocksPerTile][kLanes];
-    float q0[kBlocksPerTile][kLanes];  // inverse depth of the first surfel: moments are taken about it
-    float weight[kBlocksPerTile][kLanes], m1[kBlocksPerTile][kLanes], m2[kBlocksPerTile][kLanes];
-    float distortion[kBlocksPerTile][kLanes];
-};
 
 // A block's bit is set while one of its pixels goes on.
 MASS_INLINE unsigned start_tile(const TileWindow& w, TileForward& t, float length) {
@@ -37,29 +23,6 @@ MASS_INLINE unsigned start_tile(const TileWindow& w, TileForward& t, float lengt
     return live;
 }
 
-template <bool kLowPassOnly>
-MASS_INLINE void accumulate_extra(const Splat& s, const Normal& normal, const Sample& p, M blended, F w, F before,
-                                  F depth, F rank, float distortion_scale, TileForwardExtra& e, int block) {
-    const M early = both(blended, lt(splat(kMedianTransmittance), before));
-    store(e.median[block], select(early, depth, load(e.median[block])));
-    store(e.median_rank[block], select(early, rank, load(e.median_rank[block])));
-    store(e.nx[block], fma(w, splat(normal.x), load(e.nx[block])));
-    store(e.ny[block], fma(w, splat(normal.y), load(e.ny[block])));
-    store(e.nz[block], fma(w, splat(normal.z), load(e.nz[block])));
-    // m = a - b / z; the constant a cancels, and so does the shift by the first surfel's b / z.
-    const F q = inverse_depth_of<kLowPassOnly>(s, p);
-    const F weight = load(e.weight[block]), m1 = load(e.m1[block]), m2 = load(e.m2[block]);
-    const M first = both(blended, eq(weight, splat(0.0f)));
-    const F q0 = select(first, q, load(e.q0[block]));
-    const F m = keep(blended, mul(splat(distortion_scale), sub(q0, q)));
-    const F pairwise = fma(mul(m, m), weight, fnma(add(m, m), m1, m2));
-    store(e.q0[block], q0);
-    store(e.distortion[block], fma(w, pairwise, load(e.distortion[block])));
-    store(e.weight[block], add(weight, w));
-    store(e.m1[block], fma(w, m, m1));
-    store(e.m2[block], fma(mul(w, m), m, m2));
-}
-
 // One surfel over the blocks in `todo`. Returns the sum of its weights; clears the bits of blocks that end in `live`.
 template <bool kExtra, bool kWeights, bool kLowPassOnly>
 MASS_INLINE F blend_blocks(const CameraData& camera, const Splat& s, const Normal* normal, const TilePixels& pixels, float rank,
@@ -69,28 +32,10 @@ MASS_INLINE F blend_blocks(const CameraData& camera, const Splat& s, const Norma
     do {
         const int block = __builtin_ctz(todo);
         todo &= todo - 1;
-        const Sample p = sample<kLowPassOnly>(s, limits, load(pixels.x[block % 4]), load(pixels.y[block / 4]));
-        const F before = load(t.transmittance[block]);
-        const F after = fnma(before, p.alpha, before);
-        const M blended = both(p.valid, le(splat(kTransmittanceStop), after));
-        const F w = keep(blended, mul(before, p.alpha));
-        const F depth = depth_of<kLowPassOnly>(s, p);
-        store(t.r[block], fma(w, splat(s.r), load(t.r[block])));
-        store(t.g[block], fma(w, splat(s.g), load(t.g[block])));
-        store(t.b[block], fma(w, splat(s.b), load(t.b[block])));
-        store(t.depth[block], fma(w, depth, load(t.depth[block])));
-        F kept = select(blended, after, before);
-        if constexpr (kExtra) {
-            accumulate_extra<kLowPassOnly>(s, *normal, p, blended, w, before, depth, splat(rank), camera.distortion_scale, e, block);
-        }
-        if constexpr (kWeights) sum_of_weights = add(sum_of_weights, w);
-        const M ended = andnot(both(p.valid, lt(splat(0.0f), before)), blended);
-        if (any(ended)) {
-            store(t.stop[block], select(ended, splat(rank), load(t.stop[block])));
-            kept = select(ended, neg(before), kept);
-            if (!any(lt(splat(0.0f), kept)) && !(camera.without & kWithoutEarlyStop)) live &= ~(1u << block);
-        }
-        store(t.transmittance[block], kept);
+        const F x = load(pixels.x[block % 4]), y = load(pixels.y[block / 4]);
+        const Blended b = blend_pixels<kExtra, kLowPassOnly>(camera, s, normal, limits, x, y, rank, block, t, e);
+        if constexpr (kWeights) sum_of_weights = add(sum_of_weights, b.weight);
+        if (b.all_ended && !(camera.without & kWithoutEarlyStop)) live &= ~(1u << block);
     } while (todo != 0);
     return sum_of_weights;
 }
@@ -130,11 +75,7 @@ static int64_t blend_tile(const CameraData& camera, const ProjectedData& in, con
 
     alignas(64) float alpha[kBlocksPerTile][kLanes];
     for (int block = 0; block < kBlocksPerTile; ++block) {
-        const F T = abs(load(t.transmittance[block]));
-        const F A = sub(splat(1.0f), T);
-        store(t.transmittance[block], T);
-        store(alpha[block], A);
-        store(t.depth[block], select(lt(splat(0.0f), A), div(load(t.depth[block]), A), splat(0.0f)));
+        store(alpha[block], finish_pixels(t, block));
     }
     write_tile(camera, window, &t.r[0][0], out.rgb, 3, 0);
     write_tile(camera, window, &t.g[0][0], out.rgb, 3, 1);

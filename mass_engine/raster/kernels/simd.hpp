@@ -1,8 +1,13 @@
 // Sixteen floats at a time, in the namespace of the instruction set this file is compiled for.
 //
-// The includer defines MASS_ISA (a namespace name) and MASS_WIDTH (native lanes: 16, 8, 4 or 1). Everything here has
-// internal meaning per instruction set: nothing may be shared between translation units with different flags.
+// The includer defines MASS_ISA (a namespace name) and MASS_WIDTH (native lanes: 16, 8, 4 or 1; 0: one float instead of
+// sixteen, a GPU thread). Everything here has internal meaning per instruction set: nothing may be shared between
+// translation units with different flags.
 #pragma once
+
+#if MASS_WIDTH == 0
+#include "one_lane.hpp"
+#else
 
 #include <cstdint>
 #include <cstring>
@@ -16,6 +21,7 @@
 #endif
 
 #define MASS_INLINE static inline __attribute__((always_inline))
+#define MASS_ENTRY inline  // called by its address
 
 namespace mass::MASS_ISA {
 
@@ -280,3 +286,5 @@ MASS_INLINE F exp2_neg(F x) {
 }
 
 }  // namespace mass::MASS_ISA
+
+#endif  // MASS_WIDTH == 0

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
+from mass_engine import raster
 from mass_engine.cli import main
-from mass_engine.errors import BadArgumentError
-from mass_engine.evaluation import needed, pareto, stability_report
+from mass_engine.errors import BadArgumentError, EngineError
+from mass_engine.evaluation import bench_raster, needed, pareto, stability_report
 from mass_engine.evaluation.charts import draw_bars
 from mass_engine.evaluation.heldout import REFINED
 from mass_engine.evaluation.needed import Size, sizes
@@ -194,3 +196,11 @@ def test_the_best_of_every_clip(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert (out / "clips.png").stat().st_size > 1000
     assert main(["bench", "clips", str(runs[0]), "--metric", "nothing", "--out", str(out)]) == 2
     assert main(["bench", "clips", str(runs[3]), "--out", str(out)]) == 2
+
+
+def test_a_benchmark_on_a_gpu_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    # As if it had not been built.
+    monkeypatch.setitem(sys.modules, "mass_engine.raster._cuda_kernels", None)
+    monkeypatch.delattr(raster, "_cuda_kernels", raising=False)
+    with pytest.raises(EngineError, match=r"device\.unavailable.*make cuda"):
+        bench_raster.run(["--device", "cuda"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -100,8 +101,25 @@ def images(out: RenderOutput) -> dict[str, Tensor]:
     return {name: getattr(out, name) for name in names}
 
 
-def render(scene: Surfels, view: Camera, options: RasterOptions = EVERYTHING) -> RenderOutput:
-    return rasterize(*scene.tensors(), view, options=options)
+class Draw(Protocol):
+    """``rasterize``, or what stands in for it."""
+
+    def __call__(
+        self,
+        means: Tensor,
+        tangents: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        camera: Camera,
+        *,
+        options: RasterOptions,
+    ) -> RenderOutput: ...
+
+
+def render(
+    scene: Surfels, view: Camera, options: RasterOptions = EVERYTHING, draw: Draw = rasterize
+) -> RenderOutput:
+    return draw(*scene.tensors(), view, options=options)
 
 
 def with_gradients(
@@ -110,12 +128,13 @@ def with_gradients(
     options: RasterOptions,
     dtype: torch.dtype,
     weights: dict[str, Tensor] | None = None,
+    draw: Draw = rasterize,
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
     """Render, then the gradient of a fixed random combination of all images in every input and the camera."""
     leaves = [t.detach().to(dtype).clone().requires_grad_() for t in scene.tensors()]
     pose = view.world_to_camera.to(dtype).clone().requires_grad_()
     K = view.K.to(dtype).clone().requires_grad_()
-    out = render(Surfels(*leaves), Camera(K, pose, view.width, view.height), options)
+    out = render(Surfels(*leaves), Camera(K, pose, view.width, view.height), options, draw)
     g = torch.Generator().manual_seed(99)
     loss = torch.zeros((), dtype=dtype)
     for name, image in images(out).items():

@@ -70,10 +70,7 @@ def _sphere(vertices: Tensor) -> tuple[Tensor, float]:
 
 def row_pose(pose: HandPose, row: int) -> HandPose:
     """One row of a batched pose, as a batch of one."""
-    only = slice(row, row + 1)
-    return HandPose(
-        pose.betas[only], pose.global_orient[only], pose.hand_pose[only], pose.transl[only], pose.side
-    )
+    return pose.rows(torch.tensor([row]))
 
 
 @dataclass

@@ -15,7 +15,6 @@ from mass_engine.evaluation.synthetic.benchmark import scene_of
 from mass_engine.evaluation.synthetic.scene import FOV
 from mass_engine.fitting.evidence import spread
 from mass_engine.fitting.views import View
-from mass_engine.hand.pose import HandPose
 from mass_engine.options import FitOptions
 from mass_engine.preprocess import Clip, prepare
 from mass_engine.progress import ProgressMeter
@@ -64,11 +63,7 @@ def rows_of(clip: Clip, rows: Sequence[int]) -> Clip:
     """The clip with these rows of its views alone, in time order."""
     keep = sorted(set(rows))
     index = torch.tensor(keep)
-    pose = clip.start
-    start = HandPose(
-        pose.betas[index], pose.global_orient[index], pose.hand_pose[index], pose.transl[index], pose.side
-    )
-    return replace(clip, views=[clip.views[row] for row in keep], start=start)
+    return replace(clip, views=[clip.views[row] for row in keep], start=clip.start.rows(index))
 
 
 def reduced(view: View, side: int) -> View:

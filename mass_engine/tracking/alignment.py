@@ -213,14 +213,7 @@ def interpolate_pose(pose: HandPose, times: Sequence[float], at: Sequence[float]
     t = np.asarray(times, dtype=np.float64)
     wanted = np.clip(np.asarray(at, dtype=np.float64), t[0], t[-1])
     if len(t) == 1:
-        repeat = [0] * len(wanted)
-        return HandPose(
-            pose.betas[repeat],
-            pose.global_orient[repeat],
-            pose.hand_pose[repeat],
-            pose.transl[repeat],
-            pose.side,
-        )
+        return pose.rows(torch.zeros(len(wanted), dtype=torch.long))
     vectors = torch.cat([pose.global_orient, pose.hand_pose], -1).detach().numpy().reshape(len(t), 16, 3)
     turned = np.stack(
         [Slerp(t, Rotation.from_rotvec(vectors[:, joint]))(wanted).as_rotvec() for joint in range(16)], 1

@@ -20,6 +20,7 @@ from mass_engine.camera import Camera
 from mass_engine.channels import Channel, ChannelImage, extract, parse_channel, raster_options
 from mass_engine.deform.network import DeformationConfig
 from mass_engine.deform.posing import CompiledSurfels, MeshPose, PosableSurfels, ShadedSurfels
+from mass_engine.deform.static import StaticResiduals
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.fitting.skin import Skin
 from mass_engine.fitting.subject import Appearance, PosedSurfels, Shape, surfel_colors
@@ -34,7 +35,9 @@ from mass_engine.threads import one_thread
 from mass_engine.viewpoint import parse_camera
 
 FILE_NAME = "avatar.safetensors"
-_FORMAT = "3"
+_FORMAT = "4"
+#: Those of format 3 have no static residuals.
+_READABLE = ("3", "4")
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,7 @@ class Avatar:
             look.light,
             None if skin.deformation is None else skin.deformation.freeze(),
             skin.detached_from,
+            skin.static,
         )
 
     def _shaded(self, pose: HandPose, hand: PosedHand, camera: Camera) -> ShadedSurfels:
@@ -285,7 +289,9 @@ class Avatar:
             "best_frame": str(self.best_frame),
             "size": json.dumps([self.camera.width, self.camera.height]),
         }
-        moving = self.skin.deformation
+        moving, static = self.skin.deformation, self.skin.static
+        if static is not None:
+            tensors |= {f"static.{name}": value for name, value in static.tensors().items()}
         if moving is not None:
             tensors |= {f"deformation.{name}": value for name, value in moving.tensors().items()}
             metadata["deformation"] = json.dumps(moving.config.to_dict())
@@ -331,8 +337,8 @@ def _rasterize(surfels: ShadedSurfels, camera: Camera, options: RasterOptions) -
 
 
 def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Avatar:
-    if metadata["format"] != _FORMAT:
-        raise ValueError(f"format {metadata['format']!r}, not {_FORMAT!r}")
+    if metadata["format"] not in _READABLE:
+        raise ValueError(f"format {metadata['format']!r}, not one of {', '.join(_READABLE)}")
     if metadata["side"] not in ("left", "right"):
         raise ValueError("no side")
     side = cast("Side", metadata["side"])
@@ -371,7 +377,7 @@ def _skin(metadata: dict[str, str], tensors: dict[str, Tensor], model: HandModel
         raise ValueError("a surfel is not in the binding")
     if not 0 <= start <= len(sources):
         raise ValueError("detached_from is out of range")
-    skin = Skin(binding, sources, start)
+    skin = Skin(binding, sources, start, static=StaticResiduals.read(tensors, start))
     if "deformation" in metadata:
         config = DeformationConfig.from_dict(json.loads(metadata["deformation"]))
         skin.deformation = skin.new_deformation(model, config, 0)

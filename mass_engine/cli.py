@@ -31,6 +31,7 @@ COMPONENT_SWITCHES = {
     "refine_pose": "the tracker's poses, the template's shape",
     "shading": "no light: one colour from every side",
     "harmonics": "no view-dependent colour",
+    "settle": "attached surfels stay where the mesh has them",
 }
 
 #: ``mass-engine bench NAME``: the module whose ``run`` takes the rest of the line.

@@ -69,6 +69,7 @@ class Kernels:
         light: Tensor,
         center_units: list[float],
         deformed_from: int,
+        static: Tensor,
         surfel_share: Tensor,
         pose_share: Tensor,
         second: Tensor,

@@ -16,6 +16,7 @@ from mass_engine.deform.decoder import OUTPUTS, Layers
 from mass_engine.deform.native import shared_kernels
 from mass_engine.deform.network import FrozenDeformation
 from mass_engine.deform.residuals import deform_reference
+from mass_engine.deform.static import StaticResiduals
 from mass_engine.errors import BadArgumentError
 from mass_engine.raster.cpu import available_threads
 from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
@@ -64,7 +65,8 @@ class PosableSurfels:
 
     ``albedo`` [M,3], ``opacities`` [M], ``sh`` [M,K,3] of degree 1 on in the rest frame of the bone (K = 0,
     3, 8 or 15), ``light`` [9,3]. With a ``deformation`` the surfels from ``deformed_from`` on are moved by
-    it, one row of it each. Raises BadArgumentError ``deform.surfels`` when the parts do not fit together.
+    it, one row of it each; ``static`` moves the first, one row each. Raises BadArgumentError
+    ``deform.surfels`` when the parts do not fit together.
     """
 
     binding: MeshBinding
@@ -75,6 +77,7 @@ class PosableSurfels:
     light: Tensor
     deformation: FrozenDeformation | None = None
     deformed_from: int = 0
+    static: StaticResiduals | None = None
 
     def __post_init__(self) -> None:
         count = len(self.sources)
@@ -98,6 +101,13 @@ class PosableSurfels:
             raise BadArgumentError(
                 "deform.surfels", "A source is not in the binding.", "Use the avatar's own binding."
             )
+        most = count if self.deformation is None else self.deformed_from
+        if self.static is not None and len(self.static.offset) > most:
+            raise BadArgumentError(
+                "deform.surfels",
+                f"{len(self.static.offset)} static residuals for {most} surfels that nothing else moves.",
+                "Give those of the attached surfels.",
+            )
         if self.deformation is not None:
             rows = len(self.deformation.surfel_share)
             if not 0 <= self.deformed_from <= count or rows != count - self.deformed_from:
@@ -117,6 +127,12 @@ class PosableSurfels:
         with torch.no_grad():
             every = self.binding.register(poses.refined)
             surfels = AttachedSurfels(*(v[:, self.sources] for v in _parts(every)))
+            if self.static is not None:
+                still = len(self.static.offset)
+                attached = AttachedSurfels(*(v[:, :still] for v in _parts(surfels)))
+                settled = deform_reference(attached, self.static.residuals(len(poses.refined)))
+                both = zip(_parts(settled), _parts(surfels), strict=True)
+                surfels = AttachedSurfels(*(torch.cat([new, old[:, still:]], 1) for new, old in both))
             opacities = self.opacities.expand(len(poses.refined), -1)
             if self.deformation is not None:
                 start = self.deformed_from
@@ -146,6 +162,7 @@ class PosableSurfels:
             self.light.to(device),
             None if self.deformation is None else self.deformation.to(device),
             self.deformed_from,
+            None if self.static is None else self.static.to(device),
         )
 
     def compiled(self) -> CompiledSurfels:
@@ -173,7 +190,17 @@ class PosableSurfels:
             self.deformed_from if moving is not None else count,
             Layers(*(v.contiguous() for v in moving.layers)) if moving is not None else empty,
             moving.surfel_share.contiguous() if moving is not None else torch.zeros(0, _LANES),
+            self._static_planes(),
         )
+
+    def _static_planes(self) -> Tensor:
+        """Offset, factors of both tangents and rotation of every surfel [8,S]; none: no planes."""
+        if self.static is None:
+            return torch.zeros(0, 0)
+        found = self.static.residuals(1)
+        rows = torch.cat([found.offset[0], found.log_scale[0].exp(), found.rotation[0]], 1)
+        none = torch.tensor([0.0, 0, 0, 1, 1, 0, 0, 0])
+        return _planes(torch.cat([rows, none.expand(len(self.sources) - len(rows), -1)]), torch.float32)
 
 
 @dataclass(frozen=True)
@@ -193,6 +220,7 @@ class CompiledSurfels:
     deformed_from: int
     layers: Layers
     surfel_share: Tensor
+    static: Tensor  # [8,S] offset, factors, rotation; [0,0]: none
 
     def posed(
         self, pose: MeshPose, *, threads: int | None = None, instruction_set: str = "auto"
@@ -221,6 +249,7 @@ class CompiledSurfels:
                 self.light,
                 [*pose.center.tolist(), *units],
                 self.deformed_from,
+                self.static,
                 self.surfel_share,
                 share,
                 *self.layers,

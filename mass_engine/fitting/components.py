@@ -18,7 +18,7 @@ class Components:
     keeps them near it. ``levels`` of Loop subdivision (None: the preset's). ``refine_pose``: poses,
     shape and surface of stage one. ``exposure``: a gain per frame and colour channel. ``shading``: the
     clip's light.
-    ``harmonics``: view-dependent colour.
+    ``harmonics``: view-dependent colour. ``settle``: stage two moves and sizes attached surfels a little.
     """
 
     densify: bool = True
@@ -30,6 +30,7 @@ class Components:
     exposure: bool = False
     shading: bool = True
     harmonics: bool = True
+    settle: bool = True
 
     def __post_init__(self) -> None:
         if self.binding not in BINDINGS:

@@ -30,6 +30,8 @@ BACKGROUND_WEIGHT, FOREARM_WEIGHT = 0.2, 0.004
 HASH_LEVELS = (2, 6)
 #: Rounds of frame gains and the colours under them.
 GAIN_ROUNDS = 2
+#: Of what is seen of a surfel that may settle, this share at most is ignored.
+MOST_IGNORED = 0.05
 #: Surfels under this opacity in every frame are nothing.
 LEAST_OPACITY = 0.02
 
@@ -159,6 +161,15 @@ def finish(state: FitState, evidence: Evidence, scene: Scene) -> tuple[tuple[Ski
     return (skin.pick(kept, state.shape.model), final), trimmed
 
 
+def may_settle(evidence: Evidence, skin: Skin) -> Tensor:
+    """Which attached surfels (bool [A]) may leave the mesh a little: not those beside what is ignored.
+
+    There (a sleeve, the forearm) one frame sees as hand what another does not: surfels would turn away.
+    """
+    hand, ignored = evidence.hand[: skin.detached_from], evidence.ignored[: skin.detached_from]
+    return ignored <= MOST_IGNORED * (hand + ignored)
+
+
 def inside_wrist(evidence: Evidence, places: Tensor, wrist_x: Tensor, side: str) -> Tensor:
     """Which surfels (bool [N]) to keep: the hand ends where the clip shows it to end (a sleeve, a watch, the
     frame).
@@ -202,7 +213,7 @@ def _without_detached(skin: Skin, appearance: Appearance) -> tuple[Skin, Appeara
         appearance.sh[:count].clone(),
         appearance.light.clone(),
     )
-    return Skin(skin.binding, skin.sources[:count], count), look
+    return Skin(skin.binding, skin.sources[:count], count, static=skin.static), look
 
 
 def _copy(appearance: Appearance) -> Appearance:

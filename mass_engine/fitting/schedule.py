@@ -57,9 +57,17 @@ def schedule_for(preset: str, components: Components | None = None) -> Schedule:
         schedule = replace(schedule, depth=0)
     if not parts.harmonics:
         schedule = replace(schedule, harmonics=0)
+    if not parts.settle:
+        schedule = unsettled(schedule)
     if parts.levels is not None:
         schedule = replace(schedule, levels=parts.levels)
     return schedule
+
+
+def unsettled(schedule: Schedule) -> Schedule:
+    """The schedule with attached surfels where the mesh has them."""
+    appearance = tuple(replace(step, settle=False) for step in schedule.appearance)
+    return replace(schedule, appearance=appearance)
 
 
 def _preset(preset: str) -> Schedule:
@@ -81,7 +89,7 @@ def _preset(preset: str) -> Schedule:
             (pose, surface, replace(surface, side=256, weights=standing)),
             (),
             (),
-            (SurfelPass(256, 2),),
+            (SurfelPass(256, 2, settle=True),),
             heldout,
             40,
             256,
@@ -91,7 +99,7 @@ def _preset(preset: str) -> Schedule:
     pair = (Round(320, offsets=False), Round(320, betas=False))
     texture = (*pair * 3, *(Round(640, weights=standing),) * 5)
     deforming = (SurfelPass(320, 3, geometry=True),)
-    appearance = (SurfelPass(320, 2), SurfelPass(640, 4, rate=0.7, harmonics=True))
+    appearance = (SurfelPass(320, 2, settle=True), SurfelPass(640, 4, rate=0.7, harmonics=True, settle=True))
     outline = (*(pose,) * 4, *(surface,) * 2)
     if preset == "auto":
         return Schedule(

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mass_engine.deform.network import Deformation, DeformationConfig, UnitCube
 from mass_engine.deform.residuals import deform
+from mass_engine.deform.static import StaticResiduals
 from mass_engine.fitting.subject import PosedSurfels, Shape
 from mass_engine.hand.model import HandModel
 from mass_engine.hand.pose import HandPose
@@ -18,12 +19,14 @@ from mass_engine.surfel.binding import AttachedSurfels, MeshBinding
 @dataclass
 class Skin:
     """M surfels of ``binding``: ``sources`` [M] says whose copy each is; attached ones come first, those from
-    ``detached_from`` on are detached. ``deformation`` has a row for each detached one."""
+    ``detached_from`` on are detached. ``deformation`` has a row for each detached one, ``static`` for each
+    attached one (None: they are where the mesh has them)."""
 
     binding: MeshBinding
     sources: Tensor
     detached_from: int
     deformation: Deformation | None = None
+    static: StaticResiduals | None = None
 
     @staticmethod
     def attached(binding: MeshBinding) -> Skin:
@@ -43,12 +46,17 @@ class Skin:
         if self.sources.device == torch.device(device):
             return self
         moving = None if self.deformation is None else self.deformation.copied_to(device)
-        return Skin(self.binding.to(device), self.sources.to(device), self.detached_from, moving)
+        static = None if self.static is None else self.static.to(device)
+        return Skin(self.binding.to(device), self.sources.to(device), self.detached_from, moving, static)
 
     def take(self, other: Skin) -> None:
-        """The deformation's values in ``other``, the same surfels elsewhere."""
-        if other is not self and self.deformation is not None and other.deformation is not None:
+        """The residuals' values in ``other``, the same surfels elsewhere."""
+        if other is self:
+            return
+        if self.deformation is not None and other.deformation is not None:
             self.deformation.load_tensors(other.deformation.tensors())
+        if self.static is not None and other.static is not None:
+            self.static.take(other.static)
 
     @property
     def count(self) -> int:
@@ -90,10 +98,12 @@ class Skin:
         if self.deformation is not None:
             picked.deformation = picked.new_deformation(model, self.deformation.config, 0)
             picked.deformation.load_tensors(self.deformation.tensors())
+        if self.static is not None:
+            picked.static = self.static.rows(kept[: self.detached_from])
         return picked
 
     def pose(self, shape: Shape, pose: HandPose) -> PosedSurfels:
-        """The surfels of a batch of poses [B]; differentiable in the deformation alone."""
+        """The surfels of a batch of poses [B]; differentiable in the residuals alone."""
         with torch.no_grad():
             posed = shape.model.posed(pose, shape.displacement)
             refined = self.binding.subdivision.apply(posed.vertices)
@@ -106,7 +116,7 @@ class Skin:
         """The surfels of posed refined meshes [B,V',3], whose bones and poses these are.
 
         ``bone_rotations`` [B,16,3,3], ``joints`` [B,21,3], ``hand_pose`` [B,45], ``betas`` [B,10].
-        Differentiable in the deformation alone.
+        Differentiable in the residuals alone.
         """
         with torch.no_grad():
             surfels = self.binding.register(refined)
@@ -116,22 +126,19 @@ class Skin:
                     surfels.tangents[:, self.sources],
                     surfels.normals[:, self.sources],
                 )
-        if self.deformation is None:
+        if self.static is None and self.deformation is None:
             return PosedSurfels(surfels, refined, bone_rotations, joints)
-        start = self.detached_from
-        residuals = self.deformation(hand_pose, betas)
-        parts = (surfels.means, surfels.tangents, surfels.normals)
-        moved = deform(AttachedSurfels(*(part[:, start:] for part in parts)), residuals)
-        both = zip(parts, (moved.means, moved.tangents, moved.normals), strict=True)
-        mask = torch.cat([residuals.mask.new_ones(len(residuals.mask), start), residuals.mask], 1)
-        return PosedSurfels(
-            AttachedSurfels(*(torch.cat([part[:, :start], new], 1) for part, new in both)),
-            refined,
-            bone_rotations,
-            joints,
-            mask,
-            residuals,
+        attached, detached = (
+            _slice(surfels, rows) for rows in (slice(self.detached_from), slice(self.detached_from, None))
         )
+        if self.static is not None:
+            attached = self.static.apply(attached)
+        if self.deformation is None:
+            return PosedSurfels(_joined(attached, detached), refined, bone_rotations, joints)
+        residuals = self.deformation(hand_pose, betas)
+        moved, mask = deform(detached, residuals), residuals.mask
+        mask = torch.cat([mask.new_ones(len(mask), self.detached_from), mask], 1)
+        return PosedSurfels(_joined(attached, moved), refined, bone_rotations, joints, mask, residuals)
 
     def triangles(self, refined: Tensor) -> Tensor:
         """The refined mesh's faces [B,D,3 corners,3] that the detached surfels come from."""
@@ -139,3 +146,16 @@ class Skin:
             torch.div(self.detached, self.binding.per_face, rounding_mode="floor")
         ]
         return refined[:, faces]
+
+
+def _parts(surfels: AttachedSurfels) -> tuple[Tensor, Tensor, Tensor]:
+    return surfels.means, surfels.tangents, surfels.normals
+
+
+def _joined(first: AttachedSurfels, last: AttachedSurfels) -> AttachedSurfels:
+    both = zip(_parts(first), _parts(last), strict=True)
+    return AttachedSurfels(*(torch.cat(pair, 1) for pair in both))
+
+
+def _slice(surfels: AttachedSurfels, rows: slice) -> AttachedSurfels:
+    return AttachedSurfels(*(part[:, rows] for part in _parts(surfels)))

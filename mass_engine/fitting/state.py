@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from mass_engine.deform.network import DeformationConfig
+from mass_engine.deform.static import StaticResiduals
 from mass_engine.fitting.evidence import Evidence
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.skin import Skin
@@ -71,6 +72,8 @@ class FitState:
             if self.skin.deformation is not None:
                 tensors |= {f"deformation.{n}": v for n, v in self.skin.deformation.tensors().items()}
                 metadata["deformation"] = asdict(self.skin.deformation.config)
+            if self.skin.static is not None:
+                tensors |= {f"static.{name}": value for name, value in self.skin.static.tensors().items()}
         if self.evidence is not None:
             tensors |= {f"evidence.{name}": getattr(self.evidence, name) for name in _EVIDENCE}
         partial = path.with_name(path.name + ".partial")
@@ -112,6 +115,7 @@ class FitState:
                 self.skin.deformation.load_tensors(
                     {n.removeprefix(prefix): v for n, v in tensors.items() if n.startswith(prefix)}
                 )
+            self.skin.static = StaticResiduals.read(tensors, self.skin.detached_from)
             self.appearance = Appearance(*(tensors[f"appearance.{name}"] for name in _APPEARANCE))
         self.memory = {
             name.removeprefix("memory."): value

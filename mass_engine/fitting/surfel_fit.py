@@ -83,8 +83,8 @@ class SurfelFit:
         progress: Callable[[float], None] | None = None,
         rows: list[int] | None = None,
     ) -> PassResult:
-        """Until validation stops gaining, or ``stage.visits``; ``rows``: these instead, one visit, whatever
-        validation says."""
+        """Until validation stops gaining, or ``stage.visits``; ``rows``: these instead, one visit. Whatever
+        validation says where surfels settle or ``rows`` are given."""
         random = torch.Generator().manual_seed(seed)
         trained = rows or self.scene.trained
         given, (skin, appearance) = (skin, appearance), self._here(skin, appearance)
@@ -96,7 +96,7 @@ class SurfelFit:
         before = latest = self.validation(skin, appearance, stage.side)
         visits = 1 if rows else stage.visits
         kept = [value.detach().clone() for value in parameters]
-        visit = 0
+        free, visit = bool(rows) or stage.settle, 0
         while visit < visits:
             order = torch.randperm(len(trained), generator=random).tolist()
             plan = Visit(
@@ -113,7 +113,7 @@ class SurfelFit:
             visit += 1
             _hand_back(given, (skin, appearance))
             reached = self.validation(skin, appearance, stage.side)
-            if rows is None and reached < latest + LEAST_GAIN:
+            if not free and reached < latest + LEAST_GAIN:
                 if reached < latest:
                     with torch.no_grad():  # back to where validation was best
                         for value, good in zip(parameters, kept, strict=True):

@@ -20,7 +20,10 @@ HAND_SIZE = 0.18
 @dataclass(frozen=True)
 class SurfelWeights:
     """What the terms weigh. ``binding`` names the loss; ``delta`` metres is how far a detached surfel may be
-    from its face for nothing; ``still`` holds the residuals (in their units) towards none."""
+    from its face for nothing; ``still`` holds the residuals (in their units) towards none, ``settled`` the
+    static ones. ``holes``: how
+    much more than what sticks out a hole counts where attached surfels may leave the outline (where they may
+    not, it would only make the hand fatter)."""
 
     silhouette: float = 0.5
     binding: str = "additive"
@@ -29,6 +32,8 @@ class SurfelWeights:
     normal: float = 0.02
     distortion: float = 10.0
     still: float = 0.01
+    settled: float = 0.03
+    holes: float = 1.5
 
 
 @dataclass(frozen=True)
@@ -110,7 +115,11 @@ def surfel_loss(
             seen, wanted = (value * frame.present.unsqueeze(-1) for value in (seen, wanted))
         structure = losses.dssim(seen, wanted, inside)
         loss = (1 - dssim) * loss + dssim * 2 * structure
-    loss = loss + w.silhouette * losses.silhouette(out.alpha, level.hand, level.valid, area, holes=0.0)
+    static = None if geometry else skin.static
+    holes = 0.0 if static is None else w.holes
+    loss = loss + w.silhouette * losses.silhouette(out.alpha, level.hand, level.valid, area, holes=holes)
+    if static is not None:
+        loss = loss + w.settled * static.size()
     if not geometry:
         return loss, out
     if options.outputs == "all":

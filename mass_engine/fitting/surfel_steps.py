@@ -17,6 +17,8 @@ from mass_engine.fitting.surfel_loss import SurfelWeights
 #: Learning rates: colour, logit, harmonic coefficients, light; of the deformation, tables and layers.
 RATES = {"albedo": 0.01, "opacity_logits": 0.03, "sh": 0.002, "light": 0.001}
 TABLE_RATE, LAYER_RATE = 0.01, 0.002
+#: Of static residuals: millimetres, logarithms, radians.
+STATIC_RATES = {"offset": 0.1, "log_scale": 0.02, "rotation": 0.02}
 #: The mask's place among the deformation's outputs.
 MASK = 8
 #: What is left of the learning rates after each visit of all frames.
@@ -28,7 +30,8 @@ BETAS, EPSILON = (0.9, 0.98), 1e-15
 @dataclass(frozen=True)
 class SurfelPass:
     """One resolution. ``visits`` of all frames at most; ``geometry`` moves the detached surfels, otherwise
-    their opacity mask is free; ``harmonics`` frees the view-dependent colour."""
+    their opacity mask is free; ``harmonics`` frees the view-dependent colour. ``settle`` frees the static
+    residuals of attached surfels, and all visits are made: validation may fall on the way to closed holes."""
 
     side: int
     visits: int
@@ -36,6 +39,7 @@ class SurfelPass:
     dssim: float = 0.2
     geometry: bool = False
     harmonics: bool = False
+    settle: bool = False
 
     def shaped(self, weights: SurfelWeights) -> bool:
         """Whether the rasteriser's further outputs weigh anything."""
@@ -101,6 +105,9 @@ def groups_of(
         names.append("sh")
     for name in names:
         yield RATES[name], getattr(appearance, name)
+    if stage.settle and skin.static is not None:
+        for name, value in skin.static.parameters().items():
+            yield STATIC_RATES[name], value
     moving = skin.deformation
     if moving is None:
         return

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from mass_engine.avatar import Avatar, SourceFrames
 from mass_engine.camera import Camera
+from mass_engine.deform.static import StaticResiduals
 from mass_engine.device import Precision
 from mass_engine.fitting.components import Components
-from mass_engine.fitting.conversion import convert, deform_surfels, finish
+from mass_engine.fitting.conversion import convert, deform_surfels, finish, may_settle
 from mass_engine.fitting.evidence import Evidence, Scene, colors_of, fill_unseen, gather, spread
 from mass_engine.fitting.gauss_newton import Registrar, Round
 from mass_engine.fitting.geometry import GeometryFit, GeometryPass
@@ -248,6 +249,8 @@ class Trainer:
     def _appearance(self, part: SurfelPass, number: int, progress: Progressed) -> None:
         fitter = self._fitter()
         skin, appearance = self.state.surfels()
+        if part.settle and skin.static is None and self.state.evidence is not None:
+            skin.static = StaticResiduals.none(may_settle(self.state.evidence, skin))
         best = _best_frame(self.views)
         row = next(row for row, view in enumerate(self.views) if view.index == best)
         looks = Looks(self.scene, row, skin, appearance, self.show)

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from mass_engine.avatar import Avatar
+from mass_engine.deform.static import StaticResiduals
+from mass_engine.errors import EngineError
 from mass_engine.fitting.subject import Appearance, render_row
 from mass_engine.raster import RasterOptions
 from tests.engine.avatars import small_avatar
@@ -25,7 +31,11 @@ def colorful() -> Avatar:
         torch.randn(count, 8, 3, generator=generator) * 0.1,
         avatar.appearance.light + torch.randn(9, 3, generator=generator) * 0.1,
     )
-    return replace(avatar, skin=avatar.skin.pick(kept, avatar.shape.model), appearance=look)
+    skin = avatar.skin.pick(kept, avatar.shape.model)
+    skin.static = StaticResiduals.none(torch.arange(skin.detached_from) % 5 > 0)
+    for value in skin.static.parameters().values():
+        value.copy_(0.3 * torch.randn(value.shape, generator=generator))
+    return replace(avatar, skin=skin, appearance=look)
 
 
 def test_the_compiled_picture_is_the_one_the_fit_sees() -> None:
@@ -41,6 +51,21 @@ def test_the_compiled_picture_is_the_one_the_fit_sees() -> None:
         assert float((got.rgb - expected.rgb).abs().max()) < 5e-3
         assert float((got.rgb - expected.rgb).abs().mean()) < 1e-6
         assert float((got.depth - expected.depth).abs().mean()) < 1e-5
+
+
+def test_a_file_of_the_format_before_static_residuals_is_read(tmp_path: Path) -> None:
+    avatar = colorful()
+    avatar.skin.static = None
+    file = tmp_path / "avatar.safetensors"
+    avatar.save(file)
+    with safe_open(file, framework="pt") as opened:
+        metadata = {**opened.metadata(), "format": "3"}
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - not a dict
+    save_file(tensors, file, metadata)
+    assert Avatar.load(file).skin.static is None
+    save_file(tensors, file, {**metadata, "format": "2"})
+    with pytest.raises(EngineError, match=r"avatar\.corrupt"):
+        Avatar.load(file)
 
 
 def test_a_changed_avatar_is_compiled_anew() -> None:

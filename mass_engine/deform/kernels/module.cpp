@@ -141,7 +141,7 @@ public:
     // `center_units` is the camera's place and the two units.
     void pose_surfels(const In& vertices, const Index& corners, const Index& places, const In& coefficients, const Index& bones,
                       const In& rotations, const In& albedo, const In& harmonics, const In& opacities, const In& light,
-                      const std::vector<float>& center_units, int deformed_from, const In& share, const In& pose,
+                      const std::vector<float>& center_units, int deformed_from, const In& fixed, const In& share, const In& pose,
                       const In& second, const In& second_bias, const In& head, const In& head_bias, Out& means, Out& tangents,
                       Out& normals, Out& opacities_out, Out& colors, int threads) {
         if (center_units.size() != 5) throw std::invalid_argument("center_units needs 5 numbers");
@@ -161,6 +161,7 @@ public:
         d.stride = static_cast<int>(albedo.shape(1));
         d.harmonics_count = static_cast<int>(harmonics.shape(0)) / 3;
         d.deformed_from = deformed_from;
+        d.fixed = fixed.shape(0) == 8 ? fixed.data() : nullptr;
         d.decoder = data(share, pose, second, second_bias, center_units[3], center_units[4]);
         const Weights weights(second, head, head_bias.data(), d.decoder.hidden);
         d.decoder.head = weights.head.data();

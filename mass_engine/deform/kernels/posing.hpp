@@ -54,6 +54,13 @@ MASS_INLINE void deform(const PosingData& d, const float* block, Surfels& s) {
     s.opacity = mul(s.opacity, opacity_mask(o.mask_logit));
 }
 
+// Change them by their static residuals.
+MASS_INLINE void settle(const PosingData& d, int n, Surfels& s) {
+    const auto plane = [&](long k) { return load(d.fixed + k * d.stride + n); };
+    const Change change = {{plane(0), plane(1), plane(2)}, plane(3), plane(4), {plane(5), plane(6), plane(7)}};
+    apply(change, s.mean, s.first, s.second, s.normal);
+}
+
 MASS_INLINE void shade(const PosingData& d, const Surfels& s, int n, F* color) {
     const F x = s.normal.x, y = s.normal.y, z = s.normal.z, zero = splat(0.0f);
     const F basis[9] = {splat(1.0f), y, z, x, mul(x, y), mul(y, z), fma(mul(splat(3.0f), z), z, splat(-1.0f)), mul(x, z),
@@ -97,7 +104,9 @@ MASS_INLINE void finish(const PosingData& d, const PosedData& out, const Surfels
 inline void pose_surfels(const PosingData& d, const PosedData& out, int begin, int end) {
     const int plain = d.deformed_from < end ? d.deformed_from : end;
     for (int n = begin; n < plain; n += kLanes) {
-        finish(d, out, attached(d, n), n, plain - n < kLanes ? plain - n : kLanes);
+        Surfels s = attached(d, n);
+        if (d.fixed != nullptr) settle(d, n, s);
+        finish(d, out, s, n, plain - n < kLanes ? plain - n : kLanes);
     }
     alignas(64) float outputs[kBlockRows * kPaddedOutputs];
     for (int first = begin > plain ? begin : plain; first < end; first += kBlockRows) {

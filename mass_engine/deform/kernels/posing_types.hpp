@@ -25,6 +25,7 @@ struct PosingData {
     int count, stride, harmonics_count;  // M, -, K: 0, 3, 8 or 15
     DecoderData decoder;          // one pose; its row n is surfel deformed_from + n
     int deformed_from;            // M: none is deformed
+    const float* fixed;           // [8] planes: offset, factors of the tangents, rotation of those before; null: none
 };
 
 struct PosedData {

@@ -12,6 +12,7 @@ from mass_engine.deform import _kernels
 from mass_engine.deform.decoder import Layers
 from mass_engine.deform.network import Deformation, DeformationConfig, UnitCube
 from mass_engine.deform.posing import MeshPose, PosableSurfels
+from mass_engine.deform.static import StaticResiduals
 from mass_engine.errors import BadArgumentError
 from mass_engine.hand.builtin import load_builtin
 from mass_engine.hand.pose import HandPose
@@ -68,6 +69,15 @@ def posable(harmonics: int, deformed: int, depth: int = 1) -> tuple[PosableSurfe
     )
 
 
+def settled(surfels: PosableSurfels) -> PosableSurfels:
+    """The same with static residuals of those before the deformed ones, but for the last three."""
+    generator = torch.Generator().manual_seed(8)
+    static = StaticResiduals.none(torch.ones(surfels.deformed_from - 3))
+    for value in static.parameters().values():
+        value.copy_(torch.randn(value.shape, generator=generator) * 0.5)
+    return replace(surfels, static=static)
+
+
 def in_double(surfels: PosableSurfels, pose: MeshPose) -> tuple[PosableSurfels, MeshPose]:
     """The same in float64: in float32 the specification's own tangents have five digits."""
     moving = surfels.deformation
@@ -87,6 +97,7 @@ def in_double(surfels: PosableSurfels, pose: MeshPose) -> tuple[PosableSurfels, 
         sh=surfels.sh.double(),
         light=surfels.light.double(),
         deformation=moving,
+        static=surfels.static and StaticResiduals(*(v.double() for v in surfels.static.tensors().values())),
     )
     return exact, MeshPose(*(value.double() for value in vars(pose).values()))
 
@@ -96,13 +107,16 @@ def far(one: Tensor, other: Tensor) -> float:
 
 
 @pytest.mark.parametrize("instruction_set", _kernels.instruction_sets())
+@pytest.mark.parametrize("static", [False, True])
 @pytest.mark.parametrize(
     ("harmonics", "deformed", "depth"), [(0, 0, 0), (3, 301, 1), (8, 96, 2), (15, 5, 1), (3, 2000, 0)]
 )
 def test_it_agrees_with_the_specification(
-    instruction_set: str, harmonics: int, deformed: int, depth: int
+    instruction_set: str, harmonics: int, deformed: int, depth: int, static: bool
 ) -> None:
     surfels, pose = posable(harmonics, deformed, depth)
+    if static:
+        surfels = settled(surfels)
     got = surfels.compiled().posed(pose, instruction_set=instruction_set)
     exact, exact_pose = in_double(surfels, pose)
     expected = exact.posed(exact_pose)
@@ -118,6 +132,16 @@ def test_it_agrees_with_the_specification(
         assert far(expected.means[start:], still.means[start:]) > 1e-5
         assert far(expected.opacities[start:], still.opacities[start:]) > 0.01
         assert torch.equal(expected.means[:start], still.means[:start])
+
+
+def test_static_residuals_move_the_attached_surfels_alone() -> None:
+    surfels, pose = posable(3, 301)
+    first = surfels.deformed_from
+    plain, moved = surfels.compiled().posed(pose), settled(surfels).compiled().posed(pose)
+    assert float((plain.means - moved.means)[: first - 3].norm(dim=-1).mean()) > 1e-4
+    for name in ("means", "tangents", "normals", "opacities", "colors"):
+        assert torch.equal(getattr(plain, name)[first - 3 :], getattr(moved, name)[first - 3 :])
+    assert torch.equal(plain.opacities, moved.opacities)
 
 
 def test_any_number_of_threads_gives_the_same_bits() -> None:
@@ -149,5 +173,7 @@ def test_parts_that_do_not_fit_are_refused() -> None:
         replace(surfels, sh=surfels.sh[:, :2])
     with pytest.raises(BadArgumentError, match=r"deform\.surfels"):
         replace(surfels, deformed_from=0)
+    with pytest.raises(BadArgumentError, match=r"deform\.surfels"):
+        replace(surfels, static=StaticResiduals.none(torch.ones(surfels.deformed_from + 1)))
     with pytest.raises(BadArgumentError, match=r"deform\.surfels"):
         replace(surfels, sources=surfels.sources + surfels.binding.count)

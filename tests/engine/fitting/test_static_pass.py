@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mass_engine.deform.network import DeformationConfig
+from mass_engine.deform.static import StaticResiduals
 from mass_engine.fitting import static_pass, subject
 from mass_engine.fitting.evidence import Scene
 from mass_engine.fitting.guard import Guard
@@ -26,6 +27,7 @@ from tests.engine.pretended import nothing_of_the_host, painted, pretend_kernels
 LOOKS = SurfelPass(200, 2)
 SHAPES = SurfelPass(200, 2, geometry=True)
 VIEWS = SurfelPass(160, 2, rate=0.7, harmonics=True)
+SETTLES = SurfelPass(160, 2, settle=True)
 
 
 def odd_scene() -> Scene:
@@ -53,6 +55,8 @@ def learned(scene: Scene) -> tuple[Skin, Appearance]:
     random = torch.Generator().manual_seed(3)
     with torch.no_grad():
         skin.deformation.head.uniform_(-0.1, 0.1, generator=random)
+    skin.static = StaticResiduals.none(torch.ones(skin.detached_from))
+    skin.static.offset.uniform_(-0.2, 0.2, generator=random)
     look.sh = 0.05 * torch.randn(skin.count, 3, 3, generator=random)
     return skin, look
 
@@ -76,7 +80,7 @@ def eager_loss(
     )[0]
 
 
-@pytest.mark.parametrize("stage", [LOOKS, SHAPES, VIEWS])
+@pytest.mark.parametrize("stage", [LOOKS, SHAPES, VIEWS, SETTLES])
 def test_losses_and_gradients_are_those_of_the_unpadded_frames(stage: SurfelPass) -> None:
     scene = odd_scene()
     skin, look = learned(scene)
@@ -124,7 +128,7 @@ def after(
     return [value.detach() for _, value in groups], before, taken.undone
 
 
-@pytest.mark.parametrize("stage", [LOOKS, SHAPES, VIEWS])
+@pytest.mark.parametrize("stage", [LOOKS, SHAPES, VIEWS, SETTLES])
 def test_a_visit_goes_where_the_eager_one_goes(stage: SurfelPass) -> None:
     wanted, before, _ = after(EagerSteps, stage)
     found, _, undone = after(StaticSteps, stage)
@@ -216,7 +220,7 @@ def test_frames_of_many_sizes_lie_in_one_stack() -> None:
     assert stack.nbytes > stack.rgb.numel()
 
 
-@pytest.mark.parametrize("stage", [LOOKS, SHAPES, VIEWS])
+@pytest.mark.parametrize("stage", [LOOKS, SHAPES, VIEWS, SETTLES])
 def test_a_step_asks_its_device_nothing_and_takes_nothing_from_the_host(
     stage: SurfelPass, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from mass_engine.deform.network import DeformationConfig
+from mass_engine.deform.static import SCALE_BOUND, StaticResiduals
 from mass_engine.fitting.evidence import Scene, fill_unseen, frame_gains, gather
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.skin import Skin
@@ -20,10 +21,10 @@ from mass_engine.surfel.shading import white_light
 from tests.engine.fitting.clips import make_views, true_poses
 
 
-def thick_scene() -> Scene:
-    """Views of a hand 1.5 mm thicker than the model, true poses; two frames to validate."""
+def thick_scene(thicker: float = 0.0015) -> Scene:
+    """Views of a hand ``thicker`` metres than the model, true poses; two frames to validate."""
     model = load_builtin("right")
-    thick = replace(model, template=model.template + 0.0015 * vertex_normals(model.template, model.faces))
+    thick = replace(model, template=model.template + thicker * vertex_normals(model.template, model.faces))
     poses = true_poses(8)
     shape = Shape.mean(model, torch.zeros(10))
     options = RasterOptions(cull_backfaces=True)
@@ -51,6 +52,22 @@ def test_detached_surfels_fill_what_the_mesh_lacks(binding: str) -> None:
     assert residuals is not None
     assert float(residuals.offset[..., 2].mean()) > 1e-5, "outward, on the mean"
     assert not bool(residuals.mask_logit.any()), "the mask belongs to stage two"
+
+
+def test_attached_surfels_settle_on_a_hand_thinner_than_the_mesh() -> None:
+    scene = thick_scene(-0.0015)
+    reached = []
+    for static in (None, StaticResiduals.none(torch.ones(10288))):
+        skin, look = started(scene)
+        count = skin.detached_from
+        skin = Skin(skin.binding, skin.sources[:count], count, static=static)
+        look = Appearance(look.albedo[:count], look.opacity_logits[:count], look.sh[:count], look.light)
+        reached.append(SurfelFit(scene).run(skin, look, SurfelPass(200, 4, settle=True), 0).after)
+        if static is not None:
+            assert len(static.offset) == count
+            assert float(static.offset[:, 2].mean()) < -0.02, "inward, millimetres"
+            assert float(static.residuals(1).log_scale.abs().max()) < SCALE_BOUND
+    assert reached[1] > reached[0] + 0.5
 
 
 def test_binding_holds_the_surfels_near_the_mesh() -> None:

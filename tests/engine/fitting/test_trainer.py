@@ -19,7 +19,6 @@ from mass_engine.fitting.gauss_newton import Round
 from mass_engine.fitting.looks import LOOK_SIDE, Show
 from mass_engine.fitting.schedule import Schedule, schedule_for
 from mass_engine.fitting.subject import Appearance, render_row
-from mass_engine.fitting.surfel_fit import SurfelPass
 from mass_engine.fitting.trainer import FitResult, fit_hand
 from mass_engine.fitting.views import View
 from mass_engine.hand.builtin import load_builtin
@@ -115,6 +114,11 @@ def test_a_killed_fit_resumes_with_the_same_result(tmp_path: Path) -> None:
         assert torch.equal(getattr(one.appearance, name), getattr(two.appearance, name)), name
     assert torch.equal(one.skin.sources, two.skin.sources)
     assert torch.equal(one.frames.pose.hand_pose, two.frames.pose.hand_pose)
+    assert one.skin.static is not None
+    assert two.skin.static is not None
+    assert bool(one.skin.static.offset.any())
+    for name, value in one.skin.static.tensors().items():
+        assert torch.equal(value, two.skin.static.tensors()[name]), name
     if one.skin.deformation is not None:
         assert two.skin.deformation is not None
         for name, value in one.skin.deformation.tensors().items():
@@ -152,6 +156,7 @@ def test_the_checkpoint_of_another_fit_is_not_taken(tmp_path: Path) -> None:
         Components(exposure=True),
         Components(shading=False),
         Components(harmonics=False),
+        Components(settle=False),
     ],
     ids=str,
 )
@@ -163,7 +168,7 @@ def test_every_part_can_be_switched_off(parts: Components) -> None:
         outline=whole.outline[:1],
         texture=(),
         deforming=tuple(replace(stage, side=200, visits=1) for stage in whole.deforming),
-        appearance=(SurfelPass(200, 1, harmonics=True),),
+        appearance=tuple(replace(stage, side=200, visits=1) for stage in whole.appearance),
         heldout=whole.heldout[:1],
         validate_every=2,
         adaptive=False,
@@ -180,6 +185,7 @@ def test_every_part_can_be_switched_off(parts: Components) -> None:
     assert bool((avatar.frames.gains != 1).any()) == parts.exposure
     assert torch.equal(avatar.appearance.light, white_light()) == (not parts.shading)
     assert (avatar.appearance.sh.shape[1] > 0) == parts.harmonics
+    assert (avatar.skin.static is not None and bool(avatar.skin.static.offset.any())) == parts.settle
 
 
 def test_without_validation_frames_nothing_leaves_the_mesh() -> None:
@@ -193,7 +199,10 @@ def test_without_validation_frames_nothing_leaves_the_mesh() -> None:
 
 def test_an_avatar_with_detached_surfels_survives_its_file(tmp_path: Path) -> None:
     avatar = fitted(make_views(true_poses(9), HELDOUT)).avatar
+    assert avatar.skin.static is not None
+    assert bool(avatar.skin.static.rotation.any())
     skin = avatar.skin.with_detached(avatar.skin.sources[:500])
+    skin.static = avatar.skin.static
     skin.deformation = skin.new_deformation(avatar.shape.model, DeformationConfig(), 3)
     with torch.no_grad():
         skin.deformation.head.normal_(std=0.3, generator=torch.Generator().manual_seed(1))

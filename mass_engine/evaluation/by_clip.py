@@ -11,9 +11,7 @@ from typing import Any
 
 from mass_engine.errors import BadArgumentError
 from mass_engine.evaluation.charts import draw_bars
-from mass_engine.evaluation.heldout import FILE_NAME, REFINED, read_report
-
-_AFTER = REFINED.replace("_", " ")
+from mass_engine.evaluation.heldout import FILE_NAME, REFINED, REFINED_LABEL, read_report
 
 
 def best_by_clip(runs: Sequence[Path], metric: str) -> dict[str, dict[str, float]]:
@@ -35,7 +33,7 @@ def best_by_clip(runs: Sequence[Path], metric: str) -> dict[str, dict[str, float
         known |= first.keys()
         name = Path(str(report["video"].get("name", run.name))).stem
         clip = run.resolve().name if name == "video" else name  # data sets name their folder
-        for label, metrics in (("held out", first), (_AFTER, second)):
+        for label, metrics in (("held out", first), (REFINED_LABEL, second)):
             value = metrics.get(metric)
             if value is not None and value > found.get(clip, {}).get(label, -math.inf):
                 found.setdefault(clip, {})[label] = float(value)

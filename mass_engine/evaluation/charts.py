@@ -12,6 +12,8 @@ from mass_engine.errors import EngineError
 
 #: Colours that are told apart also by the colour-blind (Okabe and Ito 2008).
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00", "#8A8A8A", "#000000")
+#: Bars that fit side by side on a page.
+_STANDING = 24
 #: Places along each piece of a line that labels keep away from.
 _SAMPLES = 40
 #: Where a label may stand, in units of its distance from the point: right, left, above, below, corners.
@@ -104,21 +106,30 @@ def draw(charts: Chart | Sequence[Chart], path: Path, stacked: bool = False) -> 
 
 
 def draw_bars(title: str, y_label: str, values: Mapping[str, Mapping[str, float]], path: Path) -> list[Path]:
-    """A group of bars for each key of ``values``, one bar a method, its value above it; what has no value has
-    no bar. Writes PATH.svg and PATH.png."""
+    """A group of bars for each key of ``values``, one bar a method, its value at its end; what has no value
+    has no bar. Many groups lie one under the other. Writes PATH.svg and PATH.png."""
     methods = list(dict.fromkeys(method for group in values.values() for method in group))
-    figure = _canvas(max(7.0, 1.2 + 0.55 * len(values) * max(len(methods), 1)))
+    lying = len(values) * max(len(methods), 1) > _STANDING
+    long = 1.2 + (0.2 if lying else 0.55) * len(values) * max(len(methods), 1)
+    figure = _canvas(8.0, max(4.8, long)) if lying else _canvas(max(7.0, long))
     axes = figure.subplots()
     width = 0.8 / max(len(methods), 1)
     for row, method in enumerate(methods):
         places = [place for place, group in enumerate(values.values()) if method in group]
         heights = [group[method] for group in values.values() if method in group]
         shifted = [place + (row - (len(methods) - 1) / 2) * width for place in places]
-        bars = axes.bar(shifted, heights, 0.94 * width, label=method, color=PALETTE[row % len(PALETTE)])
+        bars = (axes.barh if lying else axes.bar)(
+            shifted, heights, 0.94 * width, label=method, color=PALETTE[row % len(PALETTE)]
+        )
         axes.bar_label(bars, fmt="%.4g", fontsize=7, padding=1)
-    axes.margins(y=0.1)
-    axes.set_xticks(range(len(values)), list(values), rotation=30, ha="right")
-    _name(axes, title, "", y_label)
+    if lying:
+        axes.set_yticks(range(len(values)), list(values))
+        axes.set_ylim(len(values) - 0.5, -0.5)  # the first one on top
+        axes.margins(x=0.1)
+    else:
+        axes.margins(y=0.1)
+        axes.set_xticks(range(len(values)), list(values), rotation=30, ha="right")
+    _name(axes, title, y_label if lying else "", "" if lying else y_label)
     if len(methods) > 1:
         figure.legend(fontsize=8, loc="outside lower center", ncols=len(methods), frameon=False)
     return _write(figure, path)

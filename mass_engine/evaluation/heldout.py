@@ -54,6 +54,10 @@ class HeldoutScores:
             result[REFINED] = {"metrics": mean_scores(self.refined), "per_frame": self.refined}
         return result
 
+    def write(self, run: Path) -> None:
+        """RUN/evaluation.json."""
+        (run / FILE_NAME).write_text(json.dumps(self.summary(), indent=2) + "\n")
+
     def markdown(self) -> str:
         """Both figures side by side."""
         first, second = mean_scores(self.as_fitted), mean_scores(self.refined)
@@ -169,7 +173,7 @@ def evaluate_run(
             "Give the video the run was fitted to.",
         )
     scores = score_clip(avatar, clip, lpips, RefineOptions() if refine else None)
-    (run / FILE_NAME).write_text(json.dumps(scores.summary(), indent=2) + "\n")
+    scores.write(run)
     return scores
 
 

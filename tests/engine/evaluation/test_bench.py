@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from types import ModuleType
 
+import cv2
 import pytest
 
 from mass_engine import raster
@@ -210,6 +211,10 @@ def test_bars_and_wrong_axes(tmp_path: Path) -> None:
         "by clip", "dB", {"a": {"ours": 28.0, "mesh": 25.0}, "b": {"ours": 27.0}}, tmp_path / "x"
     )
     assert [path.name for path in written] == ["x.svg", "x.png"]
+    many = {f"clip {place}": {"ours": 28.0, "mesh": 25.0} for place in range(30)}
+    picture = cv2.imread(str(draw_bars("by clip", "dB", many, tmp_path / "y")[1]))
+    assert picture is not None
+    assert picture.shape[1] < 1200 < picture.shape[0]  # still as wide as a page
     assert main(["bench", "stability", "--axis", "nothing"]) == 2
 
 
@@ -247,16 +252,21 @@ def test_the_best_of_every_clip(tmp_path: Path, capsys: pytest.CaptureFixture[st
         made("3", "waffle", 29.0),
         made("4", "waffle", 99.0, "training"),  # not held out: no figure
         made("5", "video", 27.0),
+        made("6", "pictures", 26.0),
+        made("7", "laptop", 29.0, refined=40.0),  # not the best run: its second figure is not taken
     ]
     out = tmp_path / "out"
     assert main(["bench", "clips", *map(str, runs), "--out", str(out)]) == 0
-    assert "| laptop | 30.500 | 33.000 |" in capsys.readouterr().out
+    assert f"| laptop | 30.500 | 33.000 | {runs[1]} |" in capsys.readouterr().out
     values = json.loads((out / "clips.json").read_text())["clips"]
-    assert values["waffle"] == {"held out": 29.0}
-    assert values["5"] == {"held out": 27.0}
+    assert values["waffle"]["figures"] == {"held out": 29.0}
+    assert values["5"]["figures"] == {"held out": 27.0}
+    assert values["6"]["figures"] == {"held out": 26.0}
     assert (out / "clips.png").stat().st_size > 1000
     assert main(["bench", "clips", str(runs[0]), "--metric", "nothing", "--out", str(out)]) == 2
     assert main(["bench", "clips", str(runs[3]), "--out", str(out)]) == 2
+    (runs[0] / "evaluation.json").write_text("{")
+    assert main(["bench", "clips", str(runs[0]), "--out", str(out)]) == 2
 
 
 def test_a_benchmark_on_a_gpu_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,9 +2,10 @@
 
 ``python benchmarks/heldout_sheet.py VIDEO OUT.png``
 
-Fits VIDEO with every 8th frame held out, prints the mean scores and draws up to eight of these frames: video,
-render over black, absolute error in the mask (times four), and the two silhouettes (green: mask alone; red:
-render alone; blue: ignored).
+Fits VIDEO with every 8th frame held out, prints the mean scores (and of ``--refined-frames`` those after
+test-time pose refinement) and draws up to eight of these frames as fitted: video, render over black,
+absolute error in the mask (times four), and the two silhouettes (green: mask alone; red: render alone; blue:
+ignored).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mass_engine.avatar import Avatar, row_pose
+from mass_engine.evaluation.arguments import add_refined_frames
 from mass_engine.fitting.views import View
 from mass_engine.options import FitOptions
 from mass_engine.pipeline import fit
@@ -30,8 +32,10 @@ def main() -> None:
     parser.add_argument("video", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--preset", default="auto")
+    add_refined_frames(parser, 4)
     arguments = parser.parse_args()
-    outcome = fit(arguments.video, FitOptions(holdout=8, preset=arguments.preset))
+    options = FitOptions(holdout=8, preset=arguments.preset, refined_frames=arguments.refined_frames)
+    outcome = fit(arguments.video, options)
     print(outcome.report.summary())
     rows = [row for row, view in enumerate(outcome.clip.views) if view.heldout]
     shown = [rows[place] for place in np.linspace(0, len(rows) - 1, min(8, len(rows))).round().astype(int)]

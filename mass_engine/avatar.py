@@ -54,6 +54,10 @@ class SourceFrames:
 
     def pose_of(self, index: int) -> HandPose:
         """The pose of the frame ``index``. Raises BadArgumentError ``pose.no_such_frame``."""
+        return row_pose(self.pose, self.row_of(index))
+
+    def row_of(self, index: int) -> int:
+        """The row of the frame ``index``. Raises BadArgumentError ``pose.no_such_frame``."""
         rows = (self.indices == index).nonzero()
         if len(rows) == 0:
             raise BadArgumentError(
@@ -62,7 +66,7 @@ class SourceFrames:
                 "Use a frame in which the hand was tracked, "
                 f"from {int(self.indices.min())} to {int(self.indices.max())}.",
             )
-        return row_pose(self.pose, int(rows[0]))
+        return int(rows[0])
 
 
 def _sphere(vertices: Tensor) -> tuple[Tensor, float]:

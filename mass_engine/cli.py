@@ -93,6 +93,13 @@ def build_parser() -> argparse.ArgumentParser:
     fit.add_argument(
         "--holdout", type=int, default=0, metavar="N", help="keep every N-th frame out of the fit"
     )
+    fit.add_argument(
+        "--refined-frames",
+        type=int,
+        default=0,
+        metavar="N",
+        help="score so many held-out frames once more after test-time pose refinement, seconds each",
+    )
     fit.add_argument("--seed", type=int, default=0)
     fit.add_argument("--device", choices=DEVICES, default="auto")
     fit.add_argument(
@@ -249,6 +256,7 @@ def _fit(arguments: argparse.Namespace) -> None:
         side=arguments.side,
         preset=arguments.preset,
         holdout=arguments.holdout,
+        refined_frames=arguments.refined_frames,
         seed=arguments.seed,
         device=arguments.device,
         precision=arguments.precision,

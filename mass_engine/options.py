@@ -36,6 +36,9 @@ class FitOptions:
     ``max_frames`` bounds the frames the fit sees; held-out frames do not count, of which at most 160 (or
     ``max_frames``, if that is more) are kept, evenly spread. A video of more than ``max_seconds`` is refused.
 
+    ``refined_frames``: so many held-out frames, evenly spread, are scored once more after test-time pose
+    refinement, which takes seconds a frame.
+
     ``precision`` of the deformation's matrix products on a GPU; a CPU's are always float32.
 
     ``resume``: go on after the last step that a killed fit of the same clip and options left in the run's
@@ -51,6 +54,7 @@ class FitOptions:
     side: str = "auto"
     preset: str = "auto"
     holdout: int = 0
+    refined_frames: int = 0
     seed: int = 0
     device: str = "auto"
     precision: Precision = "float32"
@@ -85,6 +89,7 @@ class FitOptions:
                 "Give a checkpoint with --segmenter sam-hq, and only with it.",
             ),
             (self.holdout == 0 or self.holdout >= 2, "holdout", self.holdout, "Use 0, or 2 and more."),
+            (self.refined_frames >= 0, "refined_frames", self.refined_frames, "Use 0 or more."),
             (self.fov is None or 5 <= self.fov <= 150, "fov", self.fov, "Use 5 to 150 degrees."),
             (2 <= self.max_frames <= 10_000, "max_frames", self.max_frames, "Use 2 to 10000."),
             (

@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from mass_engine.avatar import Avatar, row_pose
 from mass_engine.device import choose_device, device_report
 from mass_engine.errors import BadArgumentError
-from mass_engine.evaluation.scores import mean_scores, score_view
+from mass_engine.evaluation.heldout import RefinedScores, score_refined
+from mass_engine.evaluation.scores import frames_of, mean_scores, score_view
 from mass_engine.export.ply import write_ply
+from mass_engine.fitting.evidence import spread
 from mass_engine.fitting.looks import Show
 from mass_engine.fitting.report import (
     SHARED_STAGES,
@@ -180,7 +182,7 @@ def _fit_hand(
             f"The fit diverged and stepped back {found_out['undone_steps']} times.",
             "Look at the held-out frames; a clip with steadier light and less blur fits better.",
         )
-    kind, rows = _evaluate(result, clip, meter)
+    kind, rows, again = _evaluate(result, clip, meter, options.refined_frames)
     tracks = _tracks(video.name, clip, result)
     meter.update("save", 0.0)
     meter.close()
@@ -212,6 +214,7 @@ def _fit_hand(
         metrics=mean_scores(rows),
         scored_frames={"kind": kind, "count": len(rows)},
         per_frame=rows,
+        after_test_time_pose_refinement=asdict(again) if again.frames else {},
         seconds={name: round(value, 3) for name, value in meter.seconds.items()},
         peak_memory_bytes=peak_memory_bytes(),
         curves=curves(found_out),
@@ -296,22 +299,25 @@ def _write(outcome: FitOutcome, out: Path) -> FitReport:
     return outcome.report
 
 
-def _evaluate(result: FitResult, clip: Clip, meter: ProgressMeter) -> tuple[str, list[dict[str, Any]]]:
-    """Scores of the held-out frames, or of up to 32 training frames when none were held out."""
-    held = [row for row, view in enumerate(clip.views) if view.heldout]
-    rows = held or torch.linspace(0, len(clip.views) - 1, min(32, len(clip.views))).round().int().tolist()
-    pose = result.avatar.frames.pose
+def _evaluate(
+    result: FitResult, clip: Clip, meter: ProgressMeter, refined: int
+) -> tuple[str, list[dict[str, Any]], RefinedScores]:
+    """Scores of the held-out frames, or of up to 32 training frames when none were held out; and the second
+    figure of ``refined`` held-out frames."""
+    held = [view for view in clip.views if view.heldout]
+    chosen = held or [clip.views[row] for row in spread(range(len(clip.views)), 32)]
+    frames = frames_of(result.avatar, chosen)
+    share = len(chosen) / (len(chosen) + 20 * refined)  # of the time, roughly: a refinement renders thousands
     scores: list[dict[str, Any]] = []
-    for done, row in enumerate(rows):
-        view = clip.views[row]
-        scores.append(
-            {
-                "index": view.index,
-                **score_view(result.avatar, view, row_pose(pose, row), result.avatar.frames.gains[row]),
-            }
-        )
-        meter.update("evaluate", (done + 1) / len(rows))
-    return ("heldout" if held else "training"), scores
+    for done, frame in enumerate(frames):
+        scores.append({"index": frame[1].index, **score_view(*frame)})
+        meter.update("evaluate", share * (done + 1) / len(frames))
+    again = score_refined(
+        frames if held else [],
+        refined,
+        lambda done: meter.update("evaluate", share + (1 - share) * done, "test-time pose refinement"),
+    )
+    return ("heldout" if held else "training"), scores, again
 
 
 def _tracks(name: str, clip: Clip, result: FitResult) -> Tracks:

@@ -5,9 +5,27 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from mass_engine.errors import BadArgumentError
 from mass_engine.options import PRESETS
 
 DATASETS = ("arctic", "interhand", "hand-appearance")
+
+
+def add_refined_frames(parser: argparse.ArgumentParser, default: int) -> None:
+    """``--refined-frames`` of whatever scores held-out frames.
+
+    Given a number below 0 the parser raises BadArgumentError ``options.invalid``.
+    """
+    parser.add_argument("--refined-frames", type=_refined_frames, default=default, metavar="N",
+        help="held-out frames scored once more after test-time pose refinement, seconds each (default: "
+        "%(default)s; 0: none)")  # fmt: skip
+
+
+def _refined_frames(text: str) -> int:
+    count = int(text)
+    if count < 0:
+        raise BadArgumentError("options.invalid", "--refined-frames is below 0.", "Use 0 for none.")
+    return count
 
 
 def add_eval_arguments(parser: argparse.ArgumentParser) -> None:

@@ -23,7 +23,8 @@ from mass_engine.evaluation.mesh_raster import mesh_mask, rasterize_mesh
 from mass_engine.evaluation.outlines import iou
 from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.scores import Renderable
-from mass_engine.evaluation.splats import BoundSplats, SplatKind, train_splats
+from mass_engine.evaluation.splats import BoundSplats, SplatKind, steps_of, train_splats
+from mass_engine.fitting.evidence import spread
 from mass_engine.fitting.schedule import Schedule
 from mass_engine.fitting.subject import Shape, mesh_edges, vertex_normals
 from mass_engine.fitting.trainer import REGISTERED
@@ -97,9 +98,9 @@ def register(registrations: Registrations, schedule: Schedule) -> Registered:
 
 
 def fit_baseline(name: BaselineName, hand: Registered, seed: int, effort: float = 1.0) -> Baseline:
-    """Learn one representation; ``effort`` scales how often every frame is seen."""
+    """Learn one representation; ``effort`` scales how often every frame is seen (the mesh: how many are)."""
     if name == "mesh":
-        return fit_mesh(hand)
+        return fit_mesh(hand, effort)
     kinds: dict[str, SplatKind] = {
         "surfels-random": "random",
         "surfels-vertices": "vertices",
@@ -160,9 +161,12 @@ class TexturedMesh:
         return RenderOutput(image[..., :3], alpha, depth, 0)
 
 
-def fit_mesh(hand: Registered, levels: int = 3, side: int = 640, smooth: float = 0.3) -> TexturedMesh:
-    """The least-squares texture over all training frames.
+def fit_mesh(
+    hand: Registered, effort: float = 1.0, levels: int = 3, side: int = 640, smooth: float = 0.3
+) -> TexturedMesh:
+    """The least-squares texture over all training frames; with less ``effort`` over an even choice of them.
 
+    More effort than 1 is 1: the same equations twice have the same solution.
     A pixel's colour is linear in the colours of its face's corners, so the best ones solve one sparse system;
     ``smooth`` (in pixels of evidence) ties neighbours where few pixels are seen.
     """
@@ -181,7 +185,7 @@ def fit_mesh(hand: Registered, levels: int = 3, side: int = 640, smooth: float =
         off = sp.csr_array(off + off.T)
         matrices.append(sp.csr_array(sp.diags_array(off.sum(1)) - off))
         sides[channel] = 0
-    for row in hand.trained:
+    for row in spread(hand.trained, steps_of(1.0, len(hand.trained), effort)):
         level = hand.views[row].level(side)
         vertices = mesh.vertices(hand.pose(row))
         shading = irradiance_basis(vertex_normals(vertices, fine.faces)) @ hand.light

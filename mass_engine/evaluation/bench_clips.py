@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from mass_engine.errors import BadArgumentError
+from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.evaluation.synthetic.benchmark import scene_of
 from mass_engine.evaluation.synthetic.scene import FOV
 from mass_engine.fitting.evidence import spread
@@ -36,7 +36,7 @@ def clips_of(
     """Name and prepared clip of every video; without ``videos`` one synthetic clip, written to ``folder``.
 
     At most ``heldout`` held-out frames, evenly spread, are kept; crops are reduced to ``side`` pixels.
-    Raises BadArgumentError ``bench.invalid`` and what reading a video raises.
+    Raises BadArgumentError ``bench.invalid``, EngineError ``eval.no_holdout`` and what a fit raises.
     """
     if max_frames < 2 or heldout < 1 or side < 64:
         raise BadArgumentError(
@@ -55,7 +55,13 @@ def clips_of(
         clip = prepare(video, options, ProgressMeter(lambda _: None), lambda *_: None)
         held = [row for row, view in enumerate(clip.views) if view.heldout]
         trained = [row for row, view in enumerate(clip.views) if not view.heldout]
-        kept = rows_of(clip, [*trained, *(spread(held, heldout) if held else [])])
+        if not held:
+            raise EngineError(
+                "eval.no_holdout",
+                f"{video.name} shows the hand in too few frames to hold one out.",
+                f"Use a clip that shows it in {2 * HOLDOUT} frames or more.",
+            )
+        kept = rows_of(clip, [*trained, *spread(held, heldout)])
         yield video.stem, replace(kept, views=[reduced(view, side) for view in kept.views])
 
 

@@ -8,12 +8,15 @@ import json
 import os
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mass_engine.device import DEVICES
+from mass_engine.evaluation.arguments import add_refined_frames
 from mass_engine.evaluation.demo_clip import ClipOptions, demo_frames
+from mass_engine.evaluation.heldout import REFINED_LABEL, REFINED_METRIC, RefinedScores, number, score_refined
+from mass_engine.evaluation.scores import frames_of
 from mass_engine.fitting.report import FitReport
 from mass_engine.options import PRECISIONS, PRESETS, FitOptions
 from mass_engine.pipeline import fit
@@ -28,6 +31,7 @@ def run(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--preset", choices=PRESETS, nargs="+", default=["auto"])
     parser.add_argument("--holdout", type=int, default=8)
+    add_refined_frames(parser, 4)
     parser.add_argument("--max-frames", type=int, default=FitOptions.max_frames)
     parser.add_argument("--device", choices=DEVICES, default="auto")
     parser.add_argument(
@@ -55,7 +59,11 @@ def run(argv: Sequence[str]) -> None:
                     device=arguments.device,
                     precision=precision,
                 )
-                reports.append(fit(video, options).report)
+                outcome = fit(video, options)
+                held = [view for view in outcome.clip.views if view.heldout]
+                # After the fit, whose seconds these are not.
+                again = score_refined(frames_of(outcome.avatar, held), arguments.refined_frames)
+                reports.append(replace(outcome.report, after_test_time_pose_refinement=asdict(again)))
                 _print(reports[-1], preset if precision == "float32" else f"{preset}, {precision}")
     if arguments.out is not None:
         arguments.out.write_text(json.dumps([asdict(report) for report in reports], indent=1) + "\n")
@@ -77,9 +85,12 @@ def _print(report: FitReport, preset: str) -> None:
         f"{report.video['name']}, {preset}: {len(report.frames['fitted'])} frames fitted, "
         f"{report.surfels['kept']} surfels, {total:.0f} s of which the fit {report.seconds['fit']:.0f} s, "
         f"{report.peak_memory_bytes / 2**30:.2f} GiB, "
-        f"PSNR in mask {report.metrics['psnr_in_mask']:.2f} dB, "
-        f"MS-SSIM {report.metrics['ms_ssim_hand_on_black']:.4f} ({report.scored_frames['kind']})\n"
+        f"PSNR in mask {number(report.metrics['psnr_in_mask'], 2)} dB, "
+        f"MS-SSIM {number(report.metrics['ms_ssim_hand_on_black'], 4)} ({report.scored_frames['kind']})\n"
     )
+    again = RefinedScores(**report.after_test_time_pose_refinement)
+    if again.frames:
+        print(f"{REFINED_METRIC} of {len(again.frames)} of them {REFINED_LABEL}: {again.cell()} dB\n")
     print("| part | seconds |\n|---|---|")
     for name, seconds in rows.items():
         print(f"| {name} | {seconds:.1f} |")

@@ -12,6 +12,8 @@ from mass_engine.errors import EngineError
 
 #: Colours that are told apart also by the colour-blind (Okabe and Ito 2008).
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00", "#8A8A8A", "#000000")
+#: Bars that fit side by side on a page.
+_STANDING = 24
 #: Places along each piece of a line that labels keep away from.
 _SAMPLES = 40
 #: Where a label may stand, in units of its distance from the point: right, left, above, below, corners.
@@ -21,7 +23,8 @@ _AROUND = ((1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7
 @dataclass(frozen=True)
 class Series:
     """One line or cloud of a chart: places ``x``, values ``y``, short ``labels`` beside the points (optional)
-    and what those mean, one line of the legend each (``key``). ``faint``: thin and dotted, not in the legend.
+    and what those mean, one line of the legend each (``key``). ``faint``: thin and dotted, not in the legend;
+    a ``dotted`` one without points may stand for all of them there.
     """
 
     name: str
@@ -33,13 +36,16 @@ class Series:
     color: str = PALETTE[0]
     emphasis: bool = False
     faint: bool = False
+    dotted: bool = False
     key: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
 class Chart:
     """A titled pair of axes. ``log_x`` and ``log_y`` for times, sizes and errors; ``ticks`` names the places
-    0, 1, ... of an axis without numbers."""
+    0, 1, ... of an axis without numbers. ``bars``: every series is a bar beside the others', from 0 to the
+    full scale ``top``. ``height`` in inches.
+    """
 
     title: str
     x_label: str
@@ -48,63 +54,92 @@ class Chart:
     log_x: bool = False
     log_y: bool = False
     ticks: Sequence[str] = ()
+    bars: bool = False
+    top: float | None = None
+    height: float = 4.8
 
 
-def draw(charts: Chart | Sequence[Chart], path: Path) -> list[Path]:
-    """Write PATH.svg and PATH.png, several charts side by side; the legend, of the first, is on the right.
+def draw(charts: Chart | Sequence[Chart], path: Path, stacked: bool = False) -> list[Path]:
+    """Write PATH.svg and PATH.png; the legend, of everything that has a name, is on the right. Several charts
+    are side by side, or ``stacked`` one above the other on the same x axis.
 
     Raises EngineError ``charts.missing`` without matplotlib.
     """
     parts = [charts] if isinstance(charts, Chart) else list(charts)
-    lines = sum(1 + len(one.key) for one in parts[0].series if one.name and not one.faint)
-    figure = _canvas(5.6 * len(parts) + 2.2, max(4.8, 0.5 + 0.165 * lines))
-    panels = figure.subplots(1, len(parts), squeeze=False)[0]
-    for axes, chart in zip(panels, parts, strict=True):
-        for one in chart.series:
+    named: dict[str, Series] = {}
+    for one in (one for chart in parts for one in chart.series if one.name and not one.faint):
+        named.setdefault(one.name, one)
+    legend = list(named.values())
+    lines = sum(1 + len(one.key) for one in legend)
+    heights = [chart.height for chart in parts]
+    high = max(sum(heights) if stacked else max(heights), 0.5 + 0.165 * lines)
+    if stacked:
+        figure = _canvas(6.6 + 2.2, high)
+        panels = figure.subplots(len(parts), 1, squeeze=False, sharex=True, height_ratios=heights)[:, 0]
+    else:
+        figure = _canvas(5.6 * len(parts) + 2.2, high)
+        panels = figure.subplots(1, len(parts), squeeze=False)[0]
+    for place, (axes, chart) in enumerate(zip(panels, parts, strict=True)):
+        if chart.bars:
+            _plot_bars(axes, chart.series)
+        for one in () if chart.bars else chart.series:
             _plot(axes, one)
+        if chart.top is not None:
+            axes.set_ylim(0, chart.top)
         if chart.ticks:
             slanted = max(len(text) for text in chart.ticks) * len(chart.ticks) > 60
             turn = {"rotation": 30, "ha": "right"} if slanted else {}
             axes.set_xticks(range(len(chart.ticks)), list(chart.ticks), **turn)
-            axes.set_xlim(-0.4, len(chart.ticks) - 0.6)
+            axes.set_xlim(-0.45, len(chart.ticks) - 0.55)
         for name, wanted in (("x", chart.log_x), ("y", chart.log_y)):
             if wanted:
                 _logarithmic(axes, name)
-        _name(axes, chart.title, chart.x_label, chart.y_label)
-    _legend(figure, parts[0].series)
+        lowest = not stacked or place == len(parts) - 1
+        _name(axes, chart.title, chart.x_label if lowest else "", chart.y_label)
+    figure.align_ylabels()
+    _legend(figure, legend)
     figure.canvas.draw()
     for axes, chart in zip(panels, parts, strict=True):
-        _place_labels(axes, chart.series)
+        if not chart.bars:
+            _place_labels(axes, chart.series)
     return _write(figure, path)
 
 
 def draw_bars(title: str, y_label: str, values: Mapping[str, Mapping[str, float]], path: Path) -> list[Path]:
-    """A group of bars for each key of ``values``, one bar a method, its value above it; what has no value has
-    no bar. Writes PATH.svg and PATH.png."""
+    """A group of bars for each key of ``values``, one bar a method, its value at its end; what has no value
+    has no bar. Many groups lie one under the other. Writes PATH.svg and PATH.png."""
     methods = list(dict.fromkeys(method for group in values.values() for method in group))
-    figure = _canvas(max(7.0, 1.2 + 0.55 * len(values) * max(len(methods), 1)))
+    lying = len(values) * max(len(methods), 1) > _STANDING
+    long = 1.2 + (0.2 if lying else 0.55) * len(values) * max(len(methods), 1)
+    figure = _canvas(8.0, max(4.8, long)) if lying else _canvas(max(7.0, long))
     axes = figure.subplots()
     width = 0.8 / max(len(methods), 1)
     for row, method in enumerate(methods):
         places = [place for place, group in enumerate(values.values()) if method in group]
         heights = [group[method] for group in values.values() if method in group]
         shifted = [place + (row - (len(methods) - 1) / 2) * width for place in places]
-        bars = axes.bar(shifted, heights, 0.94 * width, label=method, color=PALETTE[row % len(PALETTE)])
+        bars = (axes.barh if lying else axes.bar)(
+            shifted, heights, 0.94 * width, label=method, color=PALETTE[row % len(PALETTE)]
+        )
         axes.bar_label(bars, fmt="%.4g", fontsize=7, padding=1)
-    axes.margins(y=0.1)
-    axes.set_xticks(range(len(values)), list(values), rotation=30, ha="right")
-    _name(axes, title, "", y_label)
+    if lying:
+        axes.set_yticks(range(len(values)), list(values))
+        axes.set_ylim(len(values) - 0.5, -0.5)  # the first one on top
+        axes.margins(x=0.1)
+    else:
+        axes.margins(y=0.1)
+        axes.set_xticks(range(len(values)), list(values), rotation=30, ha="right")
+    _name(axes, title, y_label if lying else "", "" if lying else y_label)
     if len(methods) > 1:
         figure.legend(fontsize=8, loc="outside lower center", ncols=len(methods), frameon=False)
     return _write(figure, path)
 
 
 def _plot(axes: Any, one: Series) -> None:
-    style = (":" if one.faint else "-") if one.line else "none"
     axes.plot(
         one.x,
         one.y,
-        linestyle=style,
+        linestyle=_style(one),
         marker=one.marker,
         color=one.color,
         markersize=15 if one.emphasis else 3 if one.faint else 6,
@@ -116,14 +151,23 @@ def _plot(axes: Any, one: Series) -> None:
     )
 
 
+def _style(one: Series) -> str:
+    return (":" if one.faint or one.dotted else "-") if one.line else "none"
+
+
+def _plot_bars(axes: Any, series: Sequence[Series]) -> None:
+    width = 0.8 / max(len(series), 1)
+    for row, one in enumerate(series):
+        shift = (row - (len(series) - 1) / 2) * width
+        axes.bar([x + shift for x in one.x], one.y, 0.94 * width, color=one.color)
+
+
 def _legend(figure: Any, series: Sequence[Series]) -> None:
     from matplotlib.lines import Line2D
 
     handles = []
     for one in series:
-        if one.faint or not one.name:
-            continue
-        look: dict[str, Any] = {"linestyle": "-" if one.line else "none", "marker": one.marker}
+        look: dict[str, Any] = {"linestyle": _style(one), "marker": one.marker}
         size = 11 if one.emphasis else 6
         handles.append(Line2D([], [], color=one.color, label=one.name, markersize=size, **look))
         handles += [Line2D([], [], linestyle="none", label=line) for line in one.key]

@@ -11,19 +11,27 @@ import argparse
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
 
 from mass_engine.evaluation import metrics
+from mass_engine.evaluation.arguments import add_refined_frames
 from mass_engine.evaluation.bench_clips import clips_of
 from mass_engine.evaluation.charts import PALETTE, Chart, Series, draw
 from mass_engine.evaluation.command import tell
-from mass_engine.evaluation.heldout import number
+from mass_engine.evaluation.heldout import (
+    REFINED_LABEL,
+    REFINED_METRIC,
+    RefinedScores,
+    number,
+    score_refined,
+    with_refined,
+)
 from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.results_file import read_rows, write_results, write_text
-from mass_engine.evaluation.scores import Comparison, mean_scores, score_view
+from mass_engine.evaluation.scores import Comparison, frames_of, mean_scores, score_view
 from mass_engine.evaluation.variants import DEFAULT
 from mass_engine.fitting.schedule import Schedule, schedule_for
 from mass_engine.fitting.trainer import FitResult
@@ -51,6 +59,7 @@ class Size:
     psnr_in_mask: float | None
     psnr_hand_on_black: float | None
     auto: bool = False
+    after_test_time_pose_refinement: RefinedScores = field(default_factory=RefinedScores)
 
 
 def sizes(harmonics: int, quick: bool) -> dict[str, Schedule]:
@@ -72,7 +81,12 @@ def sizes(harmonics: int, quick: bool) -> dict[str, Schedule]:
 
 
 def measure(
-    clip: Clip, name: str, registrations: Registrations, quick: bool, known: Sequence[Size]
+    clip: Clip,
+    name: str,
+    registrations: Registrations,
+    quick: bool,
+    known: Sequence[Size],
+    refined_frames: int,
 ) -> Iterator[Size]:
     """``auto``, then every size; what is ``known`` comes first and is not measured again."""
     yield from known
@@ -81,21 +95,29 @@ def measure(
     tell(f"{name}: {preset}")
     result, seconds = registrations.fit(schedule_for(preset))
     if preset not in done:
-        yield _size(clip, name, preset, result, seconds, auto=True)
+        yield _size(clip, name, preset, result, seconds, refined_frames, auto=True)
     harmonics = int(result.state.notes["capacity"]["harmonics"])
     for label, schedule in sizes(harmonics, quick).items():
         if label not in done:
             tell(f"{name}: {label}")
-            yield _size(clip, name, label, *registrations.fit(schedule))
+            yield _size(clip, name, label, *registrations.fit(schedule), refined_frames)
 
 
-def _size(clip: Clip, name: str, label: str, result: FitResult, seconds: float, auto: bool = False) -> Size:
+def _size(
+    clip: Clip,
+    name: str,
+    label: str,
+    result: FitResult,
+    seconds: float,
+    refined_frames: int,
+    auto: bool = False,
+) -> Size:
     avatar = result.avatar
-    held = [view for view in clip.views if view.heldout]
+    held = frames_of(avatar, [view for view in clip.views if view.heldout])
     with one_thread():
-        poses = [avatar.frames.pose_of(view.index) for view in held]
-        rows = [score_view(avatar, view, pose) for view, pose in zip(held, poses, strict=True)]
-        squares = [_squared(Comparison.of(avatar, v, p)) for v, p in zip(held, poses, strict=True)]
+        rows = [score_view(*frame) for frame in held]
+        squares = [_squared(Comparison.of(*frame)) for frame in held]
+        again = score_refined(held, refined_frames)
     means = mean_scores(rows)
     ssim = means["ms_ssim_hand_on_black"]
     return Size(
@@ -108,6 +130,7 @@ def _size(clip: Clip, name: str, label: str, result: FitResult, seconds: float, 
         means["psnr_in_mask"],
         means["psnr_hand_on_black"],
         auto,
+        again,
     )
 
 
@@ -121,21 +144,24 @@ def markdown(found: Sequence[Size], command: str) -> str:
     """One table a clip, in order of size."""
     lines = [
         f"`{command}`: held-out frames; error a pixel of the hand, of 255; torch in one thread, "
-        f"{os.cpu_count()} cores.",
+        f"{os.cpu_count()} cores. The last column: {REFINED_METRIC} of a few held-out frames as fitted, and "
+        "after test-time pose refinement.",
         "",
     ]
     for clip in dict.fromkeys(size.clip for size in found):
         lines += [
             f"**{clip}**",
             "",
-            "| model | surfels | s | error a pixel | 1 - MS-SSIM | psnr_in_mask | psnr_hand_on_black |",
-            "|---|---|---|---|---|---|---|",
+            "| model | surfels | s | error a pixel | 1 - MS-SSIM | psnr_in_mask | psnr_hand_on_black "
+            f"| {REFINED_LABEL} |",
+            "|---" * 8 + "|",
         ]
         for size in sorted((one for one in found if one.clip == clip), key=lambda one: one.surfels):
             label = f"**{size.name}** (stopped here)" if size.auto else size.name
             cells = [f"{size.surfels:,}", f"{size.seconds:.1f}", f"{size.rms:.2f}"]
             cells += [number(size.one_minus_ms_ssim, 4), number(size.psnr_in_mask, 2)]
-            lines.append(f"| {label} | {' | '.join([*cells, number(size.psnr_hand_on_black, 2)])} |")
+            cells += [number(size.psnr_hand_on_black, 2), size.after_test_time_pose_refinement.cell()]
+            lines.append(f"| {label} | {' | '.join(cells)} |")
         lines.append("")
     return "\n".join(lines)
 
@@ -177,14 +203,16 @@ def run(rest: Sequence[str]) -> None:
     add("--seed", type=int, default=0)
     add("--max-frames", type=int, default=160, help="training frames")
     add("--heldout", type=int, default=24, help="held-out frames at most")
+    add_refined_frames(parser, 4)
     add("--registrations", type=Path, metavar="DIR", help="keep them, for bench pareto too")
     add("--resume", action="store_true", help="go on with the results in --out")
     arguments = parser.parse_args(rest)
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    settings = {name: getattr(arguments, name) for name in ("quick", "seed", "max_frames", "heldout")}
+    names = ("quick", "seed", "max_frames", "heldout", "refined_frames")
+    settings = {name: getattr(arguments, name) for name in names}
     file = out / "needed.json"
-    found = [Size(**row) for row in read_rows(file, arguments.resume, settings)]
+    found = [Size(**with_refined(row)) for row in read_rows(file, arguments.resume, settings)]
     command = " ".join(["mass-engine bench needed", *rest])
     with tempfile.TemporaryDirectory() as scratch:
         for name, clip in clips_of(
@@ -195,7 +223,7 @@ def run(rest: Sequence[str]) -> None:
             )
             known = [size for size in found if size.clip == name]
             found = [size for size in found if size.clip != name]
-            for size in measure(clip, name, registrations, arguments.quick, known):
+            for size in measure(clip, name, registrations, arguments.quick, known, arguments.refined_frames):
                 found.append(size)
                 write_results(file, command, settings, [asdict(one) for one in found])
     table = markdown(found, command)

@@ -13,10 +13,11 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from mass_engine.evaluation.arguments import add_refined_frames
 from mass_engine.evaluation.baselines import (
     BASELINES,
     DESCRIPTIONS,
@@ -28,16 +29,20 @@ from mass_engine.evaluation.baselines import (
 from mass_engine.evaluation.bench_clips import clips_of
 from mass_engine.evaluation.charts import PALETTE, Chart, Series, draw
 from mass_engine.evaluation.command import tell
-from mass_engine.evaluation.heldout import REFINED, number
-from mass_engine.evaluation.refine import refine_pose
+from mass_engine.evaluation.heldout import (
+    REFINED,
+    REFINED_LABEL,
+    REFINED_METRIC,
+    RefinedScores,
+    number,
+    score_refined,
+    with_refined,
+)
 from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.results_file import read_rows, write_results, write_text
-from mass_engine.evaluation.scores import Renderable, Scores, mean_scores, score_view
+from mass_engine.evaluation.scores import Frame, Renderable, frames_of, mean_scores, score_view
 from mass_engine.evaluation.variants import DEFAULT, variants
-from mass_engine.fitting.evidence import spread
 from mass_engine.fitting.schedule import Schedule, schedule_for
-from mass_engine.fitting.views import View
-from mass_engine.hand.pose import HandPose
 from mass_engine.preprocess import Clip
 from mass_engine.threads import one_thread
 
@@ -52,16 +57,12 @@ LABELS = {
 #: Test-time refinement takes seconds a frame: these groups alone get that second figure.
 REFINED_GROUPS = ("preset", "baseline")
 
-#: What follows a metric's name, by the part of a point it is of.
-KINDS = {"metrics": "", "unrefined": "_of_the_refined_frames", "refined": f"_{REFINED}"}
-
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Point:
-    """One variant on one clip. ``refined`` holds ``metrics`` of the refined frames only, ``unrefined`` those
-    of the same frames before."""
+    """One variant on one clip."""
 
     clip: str
     group: str
@@ -71,8 +72,7 @@ class Point:
     bytes: int
     surfels: int
     metrics: dict[str, float | None]
-    refined: dict[str, float | None]
-    unrefined: dict[str, float | None]
+    after_test_time_pose_refinement: RefinedScores = field(default_factory=RefinedScores)
     error: str = ""
 
 
@@ -113,7 +113,7 @@ class Bench:
             return
         tell(f"{self.name}: registration for the baselines")
         hand: Registered = register(self.registrations, schedule_for("draft" if self.quick else DEFAULT))
-        poses = {view.index: hand.pose(row) for row, view in enumerate(self.clip.views)}
+        held = [(view, hand.pose(row)) for row, view in enumerate(self.clip.views) if view.heldout]
         for baseline in wanted:
             tell(f"{self.name}: {baseline}")
             start = time.perf_counter()
@@ -123,7 +123,8 @@ class Bench:
                 yield _failed(self.name, "baseline", baseline, error)
                 continue
             seconds = hand.seconds + time.perf_counter() - start
-            yield self._point(fitted, poses, "baseline", baseline, seconds, fitted.size_bytes, 0)
+            frames: list[Frame] = [(fitted, view, pose) for view, pose in held]
+            yield self._point(fitted, frames, "baseline", baseline, seconds, fitted.size_bytes, 0)
 
     def _ours(self, group: str, label: str, schedule: Schedule) -> Point:
         try:
@@ -134,41 +135,31 @@ class Bench:
         with tempfile.TemporaryDirectory() as folder:
             avatar.save(Path(folder))
             size = sum(path.stat().st_size for path in Path(folder).iterdir())
-        poses = {view.index: avatar.frames.pose_of(view.index) for view in self.clip.views}
-        return self._point(avatar, poses, group, label, seconds, size, avatar.skin.count)
+        frames = frames_of(avatar, [view for view in self.clip.views if view.heldout])
+        return self._point(avatar, frames, group, label, seconds, size, avatar.skin.count)
 
     def _point(
         self,
         subject: Renderable,
-        poses: dict[int, HandPose],
+        frames: list[Frame],
         group: str,
         label: str,
         seconds: float,
         size: int,
         surfels: int,
     ) -> Point:
-        held = [view for view in self.clip.views if view.heldout]
-        again = spread(range(len(held)), self.refined_frames) if group in REFINED_GROUPS else []
         with one_thread():
-            rows = [score_view(subject, view, poses[view.index]) for view in held]
-            better = [_refined(subject, held[row], poses[held[row].index]) for row in again]
-            fps = frames_per_second(subject, poses[held[0].index], held[0].camera)
-        before = _kept([rows[row] for row in again])
-        place = (self.name, group, label, seconds, fps, size, surfels)
-        return Point(*place, _kept(rows), _kept(better), before)
-
-
-def _refined(subject: Renderable, view: View, pose: HandPose) -> Scores:
-    return score_view(subject, view, refine_pose(subject, view, pose))
-
-
-def _kept(rows: Sequence[Scores]) -> dict[str, float | None]:
-    means = mean_scores(rows)
-    return {metric: means.get(metric) for metric in METRICS} if rows else {}
+            rows = [score_view(*frame) for frame in frames]
+            again = score_refined(frames, self.refined_frames if group in REFINED_GROUPS else 0)
+            _, view, pose = frames[0]
+            fps = frames_per_second(subject, pose, view.camera)
+        means = mean_scores(rows)
+        kept = {metric: means.get(metric) for metric in METRICS}
+        return Point(self.name, group, label, seconds, fps, size, surfels, kept, again)
 
 
 def _failed(clip: str, group: str, name: str, error: Exception) -> Point:
-    return Point(clip, group, name, 0.0, 0.0, 0, 0, {}, {}, {}, f"{type(error).__name__}: {error}")
+    return Point(clip, group, name, 0.0, 0.0, 0, 0, {}, error=f"{type(error).__name__}: {error}")
 
 
 def front(points: Sequence[tuple[float, float]], most: bool) -> list[int]:
@@ -196,30 +187,36 @@ def averaged(points: Sequence[Point]) -> list[dict[str, Any]]:
         for column in ("seconds", "fps", "bytes", "surfels"):
             row[column] = sum(getattr(point, column) for point in own) / len(own)
         for metric in METRICS:
-            for kind, name in KINDS.items():
-                values = [getattr(point, kind).get(metric) for point in own]
-                known = [value for value in values if value is not None]
-                row[metric + name] = sum(known) / len(known) if len(known) == len(own) else None
+            row[metric] = _mean([point.metrics.get(metric) for point in own])
+        second = [point.after_test_time_pose_refinement for point in own]
+        row[REFINED] = _mean([one.metrics.get(REFINED_METRIC) for one in second])
+        row["before"] = _mean([one.as_fitted.get(REFINED_METRIC) for one in second])
         rows.append(row)
     return rows
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """None if any is missing: a mean over other clips would say something else."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None
 
 
 def markdown(points: Sequence[Point], clips: Sequence[str], command: str) -> str:
     """The table of means, what failed, and what the baselines are."""
     lines = [
         f"`{command}`: means over {', '.join(clips)}. `seconds`: registration and what comes after it, torch "
-        f"in one thread, {os.cpu_count()} cores. *Refined*: PSNR in the mask of a few held-out frames as "
-        "fitted, and after test-time pose refinement; presets and baselines only.",
+        f"in one thread, {os.cpu_count()} cores. The last column: {REFINED_METRIC} of a few held-out frames "
+        "as fitted, and after test-time pose refinement; presets and baselines only.",
         "",
     ]
     lines.append(
-        "| what changes | variant | s | fps | kB | surfels | " + " | ".join(METRICS) + " | refined |"
+        "| what changes | variant | s | fps | kB | surfels | " + " | ".join(METRICS) + f" | {REFINED_LABEL} |"
     )
     lines.append("|---|---|---|---|---|---|" + "---|" * (len(METRICS) + 1))
     for row in averaged(points):
         cells = [f"{row['seconds']:.1f}", f"{row['fps']:.0f}", f"{row['bytes'] / 1000:.0f}"]
         cells += [f"{row['surfels']:.0f}", *(number(row.get(name)) for name in METRICS)]
-        before, after = (row["psnr_in_mask" + KINDS[kind]] for kind in ("unrefined", "refined"))
+        before, after = row["before"], row[REFINED]
         cells.append("" if after is None else f"{number(before, 2)} to {number(after, 2)}")
         lines.append(f"| {row['group']} | {row['name']} | " + " | ".join(cells) + " |")
     lines += ["", *[f"- {name}: {text}." for name, text in DESCRIPTIONS.items()]]
@@ -228,47 +225,52 @@ def markdown(points: Sequence[Point], clips: Sequence[str], command: str) -> str
 
 
 def charts(points: Sequence[Point], out: Path) -> list[Path]:
-    """Three metrics against each cost; the front is a line, the default preset a star."""
+    """Three metrics against each cost, clip by clip one above the other; each clip's front is a line, the
+    default preset a star."""
     written: list[Path] = []
-    rows = averaged(points)
-    groups = [*variants(quick=False), "baseline"]  # each its colour, whatever is missing
-    clips = ", ".join(dict.fromkeys(point.clip for point in points))
+    clips = list(dict.fromkeys(point.clip for point in points))
+    named = dict.fromkeys((point.group, point.name) for point in points if not point.error)
+    numbers = {key: str(place + 1) for place, key in enumerate(named)}
     for metric in METRICS[:3]:
         for cost, label in COSTS:
-            known = [row for row in rows if row.get(metric) is not None and row[cost] > 0]
-            if not known:
-                continue
-            places = [(float(row[cost]), float(row[metric])) for row in known]
-            best = front(places, most=cost == "fps")
-            series = [
-                Series(
-                    "front", [places[r][0] for r in best], [places[r][1] for r in best], marker="",
-                    color="#BBBBBB",
-                )
-            ]  # fmt: skip
-            ours = [row for row in known if (row["group"], row["name"]) == ("preset", DEFAULT)]
-            if ours:
-                star = [ours[0][cost]], [ours[0][metric]]
-                series.append(
-                    Series("our default", *star, line=False, marker="*", color="#C00000", emphasis=True)
-                )
-            numbers = {(row["group"], row["name"]): str(place + 1) for place, row in enumerate(rows)}
-            for place, group in enumerate(groups):
-                own = [row for row in known if row["group"] == group]
-                if not own:
-                    continue
-                labels = [numbers[row["group"], row["name"]] for row in own]
-                series.append(
-                    Series(
-                        group, [row[cost] for row in own], [row[metric] for row in own], labels, line=False,
-                        marker="s" if group == "baseline" else "o", color=PALETTE[place % len(PALETTE)],
-                        key=[f"{n}  {row['name']}" for n, row in zip(labels, own, strict=True)],
-                    )
-                )  # fmt: skip
-            title = f"Held-out frames of {clips}"
-            chart = Chart(title, label, LABELS[metric], series, log_x=True)
-            written += draw(chart, out / f"pareto-{metric}-{cost}")
+            panels = []
+            for clip in clips:
+                rows = averaged([point for point in points if point.clip == clip])
+                known = [row for row in rows if row.get(metric) is not None and row[cost] > 0]
+                if known:
+                    title = f"Held-out frames of {clip}"
+                    series = _series(known, metric, cost, numbers)
+                    panels.append(Chart(title, label, LABELS[metric], series, log_x=True))
+            if panels:
+                written += draw(panels, out / f"pareto-{metric}-{cost}", stacked=True)
     return written
+
+
+def _series(
+    rows: Sequence[dict[str, Any]], metric: str, cost: str, numbers: dict[tuple[str, str], str]
+) -> list[Series]:
+    """One clip's front, default and groups; ``numbers`` of the variants are the same for every clip."""
+    places = [(float(row[cost]), float(row[metric])) for row in rows]
+    best = front(places, most=cost == "fps")
+    xs, ys = [places[r][0] for r in best], [places[r][1] for r in best]
+    series = [Series("front", xs, ys, marker="", color="#BBBBBB")]
+    ours = [row for row in rows if (row["group"], row["name"]) == ("preset", DEFAULT)]
+    if ours:
+        star = [ours[0][cost]], [ours[0][metric]]
+        series.append(Series("our default", *star, line=False, marker="*", color="#C00000", emphasis=True))
+    for place, group in enumerate([*variants(quick=False), "baseline"]):  # each its own colour
+        own = [row for row in rows if row["group"] == group]
+        if not own:
+            continue
+        labels = [numbers[row["group"], row["name"]] for row in own]
+        series.append(
+            Series(
+                group, [row[cost] for row in own], [row[metric] for row in own], labels, line=False,
+                marker="s" if group == "baseline" else "o", color=PALETTE[place % len(PALETTE)],
+                key=[f"{n}  {name}" for (of, name), n in numbers.items() if of == group],
+            )
+        )  # fmt: skip
+    return series
 
 
 def run(rest: Sequence[str]) -> None:
@@ -280,7 +282,7 @@ def run(rest: Sequence[str]) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--max-frames", type=int, default=160, help="training frames")
     parser.add_argument("--heldout", type=int, default=24, help="held-out frames at most")
-    parser.add_argument("--refined-frames", type=int, default=4, help="of the held-out ones; 0: none")
+    add_refined_frames(parser, 4)
     parser.add_argument("--registrations", type=Path, metavar="DIR", help="keep them, for bench needed too")
     parser.add_argument("--resume", action="store_true", help="go on with the results in --out")
     arguments = parser.parse_args(rest)
@@ -289,7 +291,7 @@ def run(rest: Sequence[str]) -> None:
     names = ("quick", "seed", "max_frames", "heldout", "refined_frames")
     settings = {name: getattr(arguments, name) for name in names}
     file = out / "pareto.json"
-    points = [Point(**row) for row in read_rows(file, arguments.resume, settings)]
+    points = [Point(**with_refined(row)) for row in read_rows(file, arguments.resume, settings)]
     points = [point for point in points if not point.error]
     command = " ".join(["mass-engine bench pareto", *rest])
     clips = []

@@ -1,7 +1,8 @@
 """What goes wrong with clips, as functions of a prepared clip. Held-out frames keep clean pictures and masks.
 
-Poses are another matter: noise on them is on the held-out ones, too, and the landmarks become the noisy
-poses' own joints, as if a tracker that saw nothing better had given both.
+Poses are another matter: noise on them is on the held-out ones, too. With *pose noise* the landmarks become
+the noisy poses' own joints, as if a tracker that saw nothing better had given both; with *start noise* they
+stay what the tracker saw.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ def axes() -> dict[str, list[Level]]:
     same = Level(0.0, "as it is", lambda clip, _: clip)
     found: dict[str, list[Level]] = {
         "pose noise, rad": [Level(s, f"{s:g}", _pose_noise(s)) for s in (0.05, 0.1, 0.2, 0.3, 0.4)],
+        "start noise, rad": [Level(s, f"{s:g}", _start_noise(s)) for s in (0.1, 0.2, 0.3)],
         "masks eroded, px": [Level(p, f"{p:g}", _masks(_grown(-p))) for p in (1, 2, 4, 8)],
         "masks dilated, px": [Level(p, f"{p:g}", _masks(_grown(p))) for p in (1, 2, 4, 8)],
         "masks punched, holes": [Level(n, f"{n:g}", _masks(_punched(n))) for n in (2, 5, 10)],
@@ -92,13 +94,19 @@ def _posed(clip: Clip, start: HandPose) -> Clip:
     return replace(clip, views=views, start=start)
 
 
-def _pose_noise(sigma: float) -> Change:
-    def change(clip: Clip, random: Random) -> Clip:
-        step = torch.zeros(len(clip.views), 51)
-        step[:, :48] = torch.from_numpy(random.normal(0, sigma, (len(clip.views), 48))).float()
-        return _posed(clip, turned(clip.start, step))
+def _shaken(clip: Clip, sigma: float, random: Random) -> HandPose:
+    """The start poses with noise on every joint's and the wrist's rotation."""
+    step = torch.zeros(len(clip.views), 51)
+    step[:, :48] = torch.from_numpy(random.normal(0, sigma, (len(clip.views), 48))).float()
+    return turned(clip.start, step)
 
-    return change
+
+def _pose_noise(sigma: float) -> Change:
+    return lambda clip, random: _posed(clip, _shaken(clip, sigma, random))
+
+
+def _start_noise(sigma: float) -> Change:
+    return lambda clip, random: replace(clip, start=_shaken(clip, sigma, random))
 
 
 def _masks(of: Masks) -> Change:

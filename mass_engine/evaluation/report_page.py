@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mass_engine.avatar import Avatar
 from mass_engine.evaluation.heldout import FILE_NAME as EVALUATION
-from mass_engine.evaluation.heldout import REFINED, number, read_report
+from mass_engine.evaluation.heldout import REFINED, REFINED_LABEL, RefinedScores, number, read_report
 
 FILE_NAME = "report.html"
 #: Most held-out frames on the sheet, and the views around the hand.
@@ -136,10 +136,17 @@ def _scores(report: Mapping[str, Any], evaluation: Mapping[str, Any]) -> str:
             [_NAMES.get(name, name), number(value), *([number(second.get(name))] if second else [])]
             for name, value in evaluation["metrics"].items()
         ]
-        head = ["metric", "held-out frames", *(["after test-time pose refinement"] if second else [])]
+        head = ["metric", "held-out frames", *([REFINED_LABEL] if second else [])]
         return _table(rows, head)
-    rows = [[_NAMES.get(name, name), number(value)] for name, value in report.get("metrics", {}).items()]
-    return _table(rows, ["metric", f"{kind.replace('heldout', 'held-out')} frames"])
+    again = RefinedScores(**report.get(REFINED, {}))
+    rows = [
+        [_NAMES.get(name, name), number(value), *([again.cell(name, 3)] if again.frames else [])]
+        for name, value in report.get("metrics", {}).items()
+    ]
+    head = ["metric", f"{kind.replace('heldout', 'held-out')} frames"]
+    if again.frames:
+        head.append(f"{len(again.frames)} of them, {REFINED_LABEL}")
+    return _table(rows, head)
 
 
 def _per_frame(report: Mapping[str, Any], evaluation: Mapping[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -40,6 +40,37 @@ class Renderable(Protocol):
 
 
 @dataclass(frozen=True)
+class Exposed:
+    """``subject`` as a frame with the exposure ``gain`` [3] shows it."""
+
+    subject: Renderable
+    gain: Tensor
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the whole picture."""
+        return self.subject.camera
+
+    def render_pose(self, pose: HandPose, camera: Camera) -> RenderOutput:
+        """One pose (a batch of one) over black."""
+        out = self.subject.render_pose(pose, camera)
+        return replace(out, rgb=out.rgb * self.gain)
+
+
+#: What is scored: what renders, the view it is held against, and the pose in it (a batch of one).
+Frame = tuple[Renderable, View, HandPose]
+
+
+def frames_of(avatar: Avatar, views: Sequence[View]) -> list[Frame]:
+    """The avatar in every view's own pose and exposure."""
+    found: list[Frame] = []
+    for view in views:
+        row = avatar.frames.row_of(view.index)
+        found.append((Exposed(avatar, avatar.frames.gains[row]), view, row_pose(avatar.frames.pose, row)))
+    return found
+
+
+@dataclass(frozen=True)
 class Comparison:
     """One frame and its render, at the size the fit sees the frame.
 
@@ -56,8 +87,8 @@ class Comparison:
     size: tuple[int, int]  # height and width of that
 
     @staticmethod
-    def of(subject: Renderable, view: View, pose: HandPose, gain: Tensor | None = None) -> Comparison:
-        """Render ``pose`` through the camera of ``view``; ``gain`` [3] is the frame's exposure."""
+    def of(subject: Renderable, view: View, pose: HandPose) -> Comparison:
+        """Render ``pose`` through the camera of ``view``."""
         level = view.level(1 << 16)
         out = subject.render_pose(pose, level.camera)
         whole = subject.camera
@@ -66,7 +97,7 @@ class Comparison:
         height = max(round(whole.height * scale), y + level.camera.height)
         width = max(round(whole.width * scale), x + level.camera.width)
         return Comparison(
-            out.rgb if gain is None else out.rgb * gain,
+            out.rgb,
             level.rgb,
             out.alpha,
             level.hand > 0.5,
@@ -85,14 +116,14 @@ class Comparison:
         return picture, truth
 
 
-def score_view(subject: Renderable, view: View, pose: HandPose, gain: Tensor | None = None) -> Scores:
+def score_view(subject: Renderable, view: View, pose: HandPose) -> Scores:
     """The scores report.json holds, on 8-bit values.
 
     ``psnr_in_mask`` compares the render over black with the video inside the hand mask. The figures
     ``*_hand_on_black`` compare it with the masked video over the whole picture; ignored pixels (forearm)
     are black in both. SSIM is without padding. ``silhouette_iou`` leaves ignored pixels out.
     """
-    return _plain(Comparison.of(subject, view, pose, gain))
+    return _plain(Comparison.of(subject, view, pose))
 
 
 def score_view_fully(
@@ -144,12 +175,6 @@ def mean_scores(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def heldout_means(avatar: Avatar, views: Sequence[View]) -> dict[str, float | None]:
-    """Means of :func:`score_view` over the held-out ``views``, in the order of the avatar's frames."""
-    frames = avatar.frames
-    return mean_scores(
-        [
-            score_view(avatar, view, row_pose(frames.pose, row), frames.gains[row])
-            for row, view in enumerate(views)
-            if view.heldout
-        ]
-    )
+    """Means of :func:`score_view` over the held-out ``views``."""
+    held = [view for view in views if view.heldout]
+    return mean_scores([score_view(*frame) for frame in frames_of(avatar, held)])

@@ -173,6 +173,11 @@ def projected_tangents(means: Tensor, axes: Tensor, camera: Camera) -> Tensor:
     return (disc.reshape(-1, 3) @ rotation).view(-1, 2, 3)
 
 
+def steps_of(visits: float, frames: int, effort: float) -> int:
+    """Steps of a pass of so many ``visits`` a frame, scaled by ``effort``; few frames are seen more often."""
+    return max(1, round(effort * max(visits * frames, _LEAST_STEPS)))
+
+
 def train_splats(
     model: BoundSplats,
     views: list[View],
@@ -190,11 +195,7 @@ def train_splats(
         betas=(0.9, 0.98),
         eps=1e-15,
     )
-    plan = [
-        side
-        for side, visits in _PASSES
-        for _ in range(max(1, round(effort * max(visits * len(trained), _LEAST_STEPS))))
-    ]
+    plan = [side for side, visits in _PASSES for _ in range(steps_of(visits, len(trained), effort))]
     queue: list[int] = []
     for step, side in enumerate(plan):
         if not queue:

@@ -21,19 +21,18 @@ import numpy as np
 
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.evaluation import metrics
+from mass_engine.evaluation.arguments import add_refined_frames
 from mass_engine.evaluation.baselines import BASELINES, BaselineName, Registered, fit_baseline, register
 from mass_engine.evaluation.bench_clips import clips_of
 from mass_engine.evaluation.command import tell
+from mass_engine.evaluation.heldout import RefinedScores, score_refined, with_refined
 from mass_engine.evaluation.outlines import iou
 from mass_engine.evaluation.perturb import Level, axes
-from mass_engine.evaluation.refine import refine_pose
 from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.results_file import read_rows, write_results, write_text
-from mass_engine.evaluation.scores import Comparison, Renderable, Scores, mean_scores
+from mass_engine.evaluation.scores import Comparison, Frame, Scores, frames_of, mean_scores
 from mass_engine.evaluation.stability_report import OURS, UNCHANGED, Trial, charts, markdown
 from mass_engine.fitting.schedule import Schedule, schedule_for
-from mass_engine.fitting.views import View
-from mass_engine.hand.pose import HandPose
 from mass_engine.preprocess import Clip
 from mass_engine.threads import one_thread
 
@@ -53,11 +52,11 @@ class Condition:
 @dataclass(frozen=True)
 class Effort:
     """How every method is run: our ``schedule``, how often the ``baselines`` see every frame (1: 13 times),
-    and whether held-out poses are ``refined`` for a second figure."""
+    and how many held-out frames are ``refined`` for a second figure."""
 
     schedule: Schedule
     baselines: float
-    refined: bool
+    refined: int
 
 
 def conditions(
@@ -81,61 +80,53 @@ def trials(clip: Clip, place: Condition, methods: Sequence[str], effort: Effort)
     with tempfile.TemporaryDirectory() as folder:
         registrations = Registrations(clip, place.seed + level.reseed, Path(folder))
         hands: list[Registered] = []
+        held = {row: view for row, view in enumerate(clip.views) if view.heldout}
 
-        def ours() -> tuple[Renderable, dict[int, HandPose]]:
-            avatar = registrations.fit(effort.schedule)[0].avatar
-            return avatar, {view.index: avatar.frames.pose_of(view.index) for view in clip.views}
+        def ours() -> list[Frame]:
+            return frames_of(registrations.fit(effort.schedule)[0].avatar, list(held.values()))
 
-        def baseline(name: BaselineName) -> tuple[Renderable, dict[int, HandPose]]:
+        def baseline(name: BaselineName) -> list[Frame]:
             if not hands:
                 hands.append(register(registrations, effort.schedule))
-            poses = {view.index: hands[0].pose(row) for row, view in enumerate(clip.views)}
-            return fit_baseline(name, hands[0], registrations.seed, effort.baselines), poses
+            fitted = fit_baseline(name, hands[0], registrations.seed, effort.baselines)
+            return [(fitted, view, hands[0].pose(row)) for row, view in held.items()]
 
-        makers: dict[str, Callable[[], tuple[Renderable, dict[int, HandPose]]]] = {
+        makers: dict[str, Callable[[], list[Frame]]] = {
             OURS: ours,
             **{name: lambda name=name: baseline(name) for name in BASELINES},  # type: ignore[misc]
         }
         for method in methods:
-            yield _trial(clip, place, method, makers[method], effort.refined)
+            yield _trial(place, method, makers[method], effort.refined)
 
 
-def _trial(
-    clip: Clip,
-    place: Condition,
-    method: str,
-    make: Callable[[], tuple[Renderable, dict[int, HandPose]]],
-    refine: bool,
-) -> Trial:
+def _trial(place: Condition, method: str, make: Callable[[], list[Frame]], refined: int) -> Trial:
     key = (place.clip, place.axis, place.level.value, place.level.name, method, place.seed)
     started = time.perf_counter()
     try:
-        found = _score(*make(), clip, refine)
+        frames = make()
+        spent = round(time.perf_counter() - started, 1)
+        return Trial(*key, *_score(frames, refined), spent)
     except _FAILURES as error:
         spent = round(time.perf_counter() - started, 1)
-        return Trial(*key, None, None, None, None, spent, f"{type(error).__name__}: {error}"[:200])
-    return Trial(*key, *found, round(time.perf_counter() - started, 1))
+        why = f"{type(error).__name__}: {error}"[:200]
+        return Trial(*key, None, None, None, seconds=spent, error=why)
 
 
 def _score(
-    subject: Renderable, poses: dict[int, HandPose], clip: Clip, refine: bool
-) -> tuple[float | None, float | None, float | None, float | None]:
-    """Mean PSNR in the mask, on black and silhouette IoU; the first again after test-time refinement."""
-    held = [view for view in clip.views if view.heldout]
+    frames: Sequence[Frame], refined: int
+) -> tuple[float | None, float | None, float | None, RefinedScores]:
+    """Mean PSNR in the mask, on black and silhouette IoU of held-out frames, and the second figure."""
     with one_thread():
-        rows = [_scores(subject, view, poses[view.index]) for view in held]
-        again = [
-            _scores(subject, view, refine_pose(subject, view, poses[view.index]))
-            for view in (held if refine else [])
-        ]
-    if not all(math.isfinite(row["psnr"]) for row in rows):
-        raise ArithmeticError("a held-out frame has no finite score")
-    first, second = mean_scores(rows), mean_scores(again)
-    return first["psnr"], first["psnr_on_black"], first["iou"], second.get("psnr")
+        rows = [_scores(frame) for frame in frames]
+        if not all(math.isfinite(row["psnr"]) for row in rows):
+            raise ArithmeticError("a held-out frame has no finite score")
+        again = score_refined(frames, refined)
+    means = mean_scores(rows)
+    return means["psnr"], means["psnr_on_black"], means["iou"], again
 
 
-def _scores(subject: Renderable, view: View, pose: HandPose) -> Scores:
-    found = Comparison.of(subject, view, pose)
+def _scores(frame: Frame) -> Scores:
+    found = Comparison.of(*frame)
     render = metrics.to_8bit(found.render)
     return {
         "psnr": metrics.psnr(render, found.video, found.hand) if bool(found.hand.any()) else math.nan,
@@ -147,24 +138,24 @@ def _scores(subject: Renderable, view: View, pose: HandPose) -> Scores:
 def run(rest: Sequence[str]) -> None:
     """The command."""
     arguments = _parser().parse_args(rest)
-    wanted = _wanted(arguments.axis, arguments.quick)
+    wanted = wanted_axes(arguments.axis, arguments.level, arguments.quick)
     if arguments.seeds < 1 or arguments.effort <= 0:
         raise BadArgumentError("bench.invalid", "No seed, or no effort.", "Use --seeds 1 --effort 0.5, say.")
     methods = tuple(arguments.method) or (OURS, *BASELINES)
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     command = " ".join(["mass-engine bench stability", *rest])
-    names = ("quick", "preset", "max_frames", "heldout", "side", "effort", "refine")
+    names = ("quick", "preset", "max_frames", "heldout", "side", "effort", "refined_frames")
     settings = {name: getattr(arguments, name) for name in names}
     file = out / "stability.json"
-    found = [Trial(**row) for row in read_rows(file, arguments.resume, settings)]
+    found = [Trial(**with_refined(row)) for row in read_rows(file, arguments.resume, settings)]
     clips = dict(
         clips_of(
             arguments.videos, arguments.quick, 0, arguments.max_frames, out, arguments.heldout, arguments.side
         )
     )
     preset = "draft" if arguments.quick else arguments.preset
-    effort = Effort(schedule_for(preset), arguments.effort, arguments.refine)
+    effort = Effort(schedule_for(preset), arguments.effort, arguments.refined_frames)
     notes = _notes(arguments, preset, clips)
     for place in conditions(list(clips), wanted, range(1 if arguments.quick else arguments.seeds)):
         key = (place.clip, place.axis, place.level.name, place.seed)
@@ -194,6 +185,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=Path, default=Path("bench-stability"))
     add("--quick", action="store_true", help="two axes, one level, only to see that it works")
     add("--axis", action="append", default=[], metavar="NAME", help="part of an axis's name")
+    add("--level", action="append", default=[], metavar="NAME", help="only this level of the axes")
     add("--method", action="append", default=[], choices=(OURS, *BASELINES))
     add("--preset", default="auto", choices=("draft", "auto", "full"))
     add("--seeds", type=int, default=1)
@@ -201,20 +193,32 @@ def _parser() -> argparse.ArgumentParser:
     add("--heldout", type=int, default=12, help="held-out frames at most")
     add("--side", type=int, default=320, help="longer side of the crops, pixels")
     add("--effort", type=float, default=0.5, help="of the baselines; 1: every frame 13 times")
-    add("--refine", action="store_true", help="score after test-time refinement, too")
+    add_refined_frames(parser, 2)
     add("--resume", action="store_true", help="go on with the results in --out")
     return parser
 
 
-def _wanted(parts: Sequence[str], quick: bool) -> dict[str, list[Level]]:
+def wanted_axes(parts: Sequence[str], names: Sequence[str], quick: bool) -> dict[str, list[Level]]:
+    """The axes that are asked for, each with the clip as it is and the levels that are."""
     known = axes()
-    wanted = {
-        name: levels for name, levels in known.items() if not parts or any(part in name for part in parts)
-    }
+    same = next(iter(known.values()))[0]
+    known[UNCHANGED] = [same]
+    if not parts:
+        parts = [name for name in known if name != UNCHANGED]
+    wanted = {name: levels for name, levels in known.items() if any(part in name for part in parts)}
     if not wanted:
         raise BadArgumentError("bench.axis", "No such axis.", f"Use part of: {', '.join(known)}.")
+    strange = set(names) - {level.name for levels in wanted.values() for level in levels}
+    if strange:
+        offered = "; ".join(f"{name}: {', '.join(one.name for one in wanted[name][1:])}" for name in wanted)
+        raise BadArgumentError("bench.level", f"No axis has level {min(strange)}.", f"Use {offered}.")
+    if names:
+        wanted = {
+            axis: [levels[0], *(level for level in levels[1:] if level.name in names)]
+            for axis, levels in wanted.items()
+        }
     if quick:
-        wanted = {name: [levels[0], levels[-1]] for name, levels in list(wanted.items())[:2]}
+        wanted = {name: levels[:1] + levels[1:][-1:] for name, levels in list(wanted.items())[:2]}
     return wanted
 
 
@@ -227,5 +231,5 @@ def _notes(arguments: argparse.Namespace, preset: str, clips: dict[str, Clip]) -
     return [
         f"Clips: {frames}; crops of at most {arguments.side} pixels, in which pixels of an axis are counted.",
         f"Ours: preset {preset}. Baselines: the same registration, then {arguments.effort:g} times their "
-        "usual steps (usual: every frame 13 times).",
+        "usual steps (usual: every frame 13 times, the mesh once).",
     ]

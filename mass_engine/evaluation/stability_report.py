@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mass_engine.evaluation.baselines import BASELINES
 from mass_engine.evaluation.charts import PALETTE, Chart, Series, draw
-from mass_engine.evaluation.heldout import REFINED
+from mass_engine.evaluation.heldout import REFINED, REFINED_LABEL, REFINED_METRIC, RefinedScores
+from mass_engine.evaluation.perturb import axes
 
 #: More than this lost is a failure, dB.
 FAILURE = 3.0
@@ -18,6 +19,9 @@ OURS = "ours"
 #: The axis of the clip as it is, the first place of every other axis.
 UNCHANGED = "as it is"
 _LABELS = {"psnr": "PSNR in the mask, dB", "psnr_on_black": "PSNR of the hand on black, dB"}
+
+
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -34,45 +38,42 @@ class Trial:
     psnr: float | None
     psnr_on_black: float | None
     iou: float | None
-    refined_psnr: float | None = None
+    after_test_time_pose_refinement: RefinedScores = field(default_factory=RefinedScores)
     seconds: float = 0.0
     error: str = ""
 
 
-def summarised(found: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Mean, worst and failure rate of every axis, level and method over clips and seeds."""
+def summarised(found: Sequence[Trial]) -> list[Row]:
+    """Mean, worst, best and failure rate of every axis, level and method over clips and seeds; the levels in
+    the order of their axis, whatever ran first."""
     base = {(t.clip, t.method, t.seed): t for t in found if t.axis == UNCHANGED}
+    known = axes()
     rows = []
     for axis in axes_of(found):
         own_axis = [t for t in found if t.axis in (UNCHANGED, axis)]
-        keys = [
-            dict.fromkeys((t.value, t.level, t.method) for t in own_axis if t.axis == name)
-            for name in dict.fromkeys((UNCHANGED, axis))
-        ]
-        for key in [
-            *keys[0],
-            *(key for part in keys[1:] for key in reversed(part)),
-        ]:  # worst levels ran first
+        order = [level.name for level in known.get(axis, [])]
+        keys = dict.fromkeys((t.value, t.level, t.method) for t in own_axis)
+        for key in sorted(keys, key=lambda key: order.index(key[1]) if key[1] in order else len(order)):
             own = [t for t in own_axis if (t.value, t.level, t.method) == key]
             failed = [t for t in own if _failed(t, base.get((t.clip, t.method, t.seed)))]
-            rows.append(
-                {
-                    "axis": axis,
-                    "value": key[0],
-                    "level": key[1],
-                    "method": key[2],
-                    "runs": len(own),
-                    "psnr": _mean([t.psnr for t in own]),
-                    "psnr_worst": min((t.psnr for t in own if t.psnr is not None), default=None),
-                    "psnr_on_black": _mean([t.psnr_on_black for t in own]),
-                    "psnr_on_black_worst": min(
-                        (t.psnr_on_black for t in own if t.psnr_on_black is not None), default=None
-                    ),
-                    "iou": _mean([t.iou for t in own]),
-                    f"psnr_{REFINED}": _mean([t.refined_psnr for t in own]),
-                    "failure_rate": len(failed) / len(own),
-                }
-            )
+            second = [t.after_test_time_pose_refinement for t in own]
+            row = {
+                "axis": axis,
+                "value": key[0],
+                "level": key[1],
+                "method": key[2],
+                "runs": len(own),
+                "iou": _mean([t.iou for t in own]),
+                REFINED: _mean([one.metrics.get(REFINED_METRIC) for one in second]),
+                "before": _mean([one.as_fitted.get(REFINED_METRIC) for one in second]),
+                "failure_rate": len(failed) / len(own),
+            }
+            for column in _LABELS:
+                values = [value for t in own if (value := getattr(t, column)) is not None]
+                row[column] = _mean(values)
+                row[f"{column}_worst"] = min(values, default=None)
+                row[f"{column}_best"] = max(values, default=None)
+            rows.append(row)
     return rows
 
 
@@ -96,51 +97,57 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def markdown(found: Sequence[Trial], command: str, notes: Sequence[str]) -> str:
-    """One table an axis: mean and worst in the mask, mean on black, and failures."""
+    """Two tables an axis: scores as fitted, with failures, and the second figure if there is one."""
     rows = summarised(found)
-    methods = list(dict.fromkeys(row["method"] for row in rows))
     lines = [
-        f"`{command}`: held-out frames: PSNR in the mask, mean (worst of several runs) / PSNR of the hand on "
-        "black, mean, in dB; then the share of runs that fail (raise, are not finite, or lose more than "
-        f"{FAILURE:g} dB of either).",
+        f"`{command}`: held-out frames: PSNR in the mask, mean (worst to best of several runs) / PSNR of the "
+        "hand on black, mean, in dB; then the share of runs that fail (raise, are not finite, or lose more "
+        f"than {FAILURE:g} dB of either).",
         "",
         *[f"- {note}" for note in notes],
         "",
     ]
     for axis in dict.fromkeys(row["axis"] for row in rows):
-        lines += [
-            f"**{axis}**",
-            "",
-            f"| level | runs | {' | '.join(methods)} |",
-            "|---" * (len(methods) + 2) + "|",
-        ]
         own = [row for row in rows if row["axis"] == axis]
-        for level in dict.fromkeys(row["level"] for row in own):
-            cells = []
-            for method in methods:
-                row = next((r for r in own if (r["level"], r["method"]) == (level, method)), None)
-                cells.append(_cell(row))
-            runs = max(row["runs"] for row in own if row["level"] == level)
-            lines.append(f"| {level} | {runs} | {' | '.join(cells)} |")
-        lines.append("")
+        lines += [f"**{axis}**", "", *_table(own, _cell), ""]
+        if any(row[REFINED] is not None for row in own):
+            lines += [
+                f"{axis}, {REFINED_LABEL}: {REFINED_METRIC} of a few held-out frames, before and after",
+                "",
+            ]
+            lines += [*_table(own, _refined_cell), ""]
     errors = dict.fromkeys(f"{t.axis}, {t.level}, {t.method}: {t.error}" for t in found if t.error)
     lines += [f"- {error}" for error in errors]
     return "\n".join(lines) + "\n"
 
 
-def _cell(row: dict[str, Any] | None) -> str:
-    if row is None:
-        return ""
+def _table(rows: Sequence[Row], cell: Callable[[Row], str]) -> list[str]:
+    """A line a level, a column a method."""
+    methods = [name for name in (OURS, *BASELINES) if any(row["method"] == name for row in rows)]
+    lines = [f"| level | runs | {' | '.join(methods)} |", "|---" * (len(methods) + 2) + "|"]
+    for level in dict.fromkeys(row["level"] for row in rows):
+        own = {row["method"]: row for row in rows if row["level"] == level}
+        cells = [cell(own[name]) if name in own else "" for name in methods]
+        runs = max(row["runs"] for row in own.values())
+        lines.append(f"| {level} | {runs} | {' | '.join(cells)} |")
+    return lines
+
+
+def _cell(row: Row) -> str:
     if row["psnr"] is None or row["psnr_on_black"] is None:
         return "failed"
     lost = f", {row['failure_rate']:.0%} fail" if row["failure_rate"] else ""
-    worst = f" ({row['psnr_worst']:.2f})" if row["runs"] > 1 else ""
-    return f"{row['psnr']:.2f}{worst} / {row['psnr_on_black']:.2f}{lost}"
+    spread = f" ({row['psnr_worst']:.2f} to {row['psnr_best']:.2f})" if row["runs"] > 1 else ""
+    return f"{row['psnr']:.2f}{spread} / {row['psnr_on_black']:.2f}{lost}"
+
+
+def _refined_cell(row: Row) -> str:
+    return "" if row[REFINED] is None else f"{row['before']:.2f} to {row[REFINED]:.2f}"
 
 
 def charts(found: Sequence[Trial], out: Path, wanted: Sequence[str] = ()) -> list[Path]:
     """One figure an axis (``wanted``: only these): both PSNR of every method, its worst run as a thin second
-    line; a cross where a run fails, at the bottom and with a gap in the line where none came out."""
+    line, with a gap where no run came out; under them the share of runs that fail."""
     written: list[Path] = []
     rows = summarised(found)
     for axis in dict.fromkeys(row["axis"] for row in rows):
@@ -148,37 +155,49 @@ def charts(found: Sequence[Trial], out: Path, wanted: Sequence[str] = ()) -> lis
             continue
         own = [row for row in rows if row["axis"] == axis]
         levels = list(dict.fromkeys(row["level"] for row in own))
+        titles = f"Stability: {axis}", ""
         panels = [
-            Chart(f"Stability: {axis}", axis, label, _series(own, levels, column), ticks=levels)
-            for column, label in _LABELS.items()
+            Chart(title, axis, label, _lines(own, levels, column), ticks=levels, height=3.2)
+            for title, (column, label) in zip(titles, _LABELS.items(), strict=True)
         ]
+        failures = _failures(own, levels)
+        panels.append(
+            Chart("", axis, "runs that fail, %", failures, ticks=levels, bars=True, top=100, height=1.8)
+        )
         name = "".join(c if c.isalnum() else "-" for c in axis.split(",")[0]).strip("-")
-        written += draw(panels, out / f"stability-{name}")
+        written += draw(panels, out / f"stability-{name}", stacked=True)
     return written
 
 
-def _series(rows: Sequence[dict[str, Any]], levels: Sequence[str], column: str) -> list[Series]:
-    order = (OURS, *BASELINES)
+def _lines(rows: Sequence[Row], levels: Sequence[str], column: str) -> list[Series]:
     series = []
-    lowest = min((row[column] for row in rows if row[column] is not None), default=0.0)
-    crosses: list[tuple[float, float]] = []
-    for method in [name for name in order if any(row["method"] == name for row in rows)]:
-        points = {row["level"]: row for row in rows if row["method"] == method}
-        places = [float(place) for place, level in enumerate(levels) if level in points]
-        own = [points[level] for level in levels if level in points]
-        color = PALETTE[order.index(method)]
+    several = any(row["runs"] > 1 for row in rows)
+    for method, color, places, own in _by_method(rows, levels):
         series.append(Series(method, places, [_plotted(row[column]) for row in own], color=color))
-        if any(row["runs"] > 1 for row in own):
+        if several:
             worst = [_plotted(row[f"{column}_worst"]) for row in own]
             series.append(Series(f"{method}, worst", places, worst, color=color, faint=True))
-        for place, row in zip(places, own, strict=True):
-            if row["failure_rate"]:
-                crosses.append((place, lowest if row[column] is None else row[column]))
-    if crosses:
-        xs, ys = [x for x, _ in crosses], [y for _, y in crosses]
-        failing = Series("a run fails", xs, ys, line=False, marker="x", color="#000000")
-        series.append(failing)
+    if several:
+        series.append(Series("worst run", [], [], marker="", color="#555555", dotted=True))
     return series
+
+
+def _failures(rows: Sequence[Row], levels: Sequence[str]) -> list[Series]:
+    return [
+        Series(method, places, [100 * row["failure_rate"] for row in own], color=color)
+        for method, color, places, own in _by_method(rows, levels)
+    ]
+
+
+def _by_method(
+    rows: Sequence[Row], levels: Sequence[str]
+) -> Iterator[tuple[str, str, list[float], list[Row]]]:
+    """Every method's name, colour, places on the axis and rows there."""
+    for name, color in zip((OURS, *BASELINES), PALETTE, strict=False):
+        points = {row["level"]: row for row in rows if row["method"] == name}
+        places = [place for place, level in enumerate(levels) if level in points]
+        if points:
+            yield name, color, [float(place) for place in places], [points[levels[p]] for p in places]
 
 
 def _plotted(value: float | None) -> float:

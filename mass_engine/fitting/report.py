@@ -21,7 +21,9 @@ _PACKAGES = ("mass-hand", "torch", "numpy", "opencv-contrib-python-headless", "a
 
 @dataclass
 class FitReport:
-    """``metrics`` are means over the scored frames, ``scored_frames`` says which kind those were."""
+    """``metrics`` are means over the scored frames, ``scored_frames`` says which kind those were. The second
+    figure, ``after_test_time_pose_refinement``, is of a few held-out ``frames``: their ``metrics``, and the
+    same frames' ``as_fitted``; empty where none were asked for."""
 
     video: dict[str, Any]
     options: dict[str, Any]
@@ -32,6 +34,7 @@ class FitReport:
     metrics: dict[str, float | None] = field(default_factory=dict)
     scored_frames: dict[str, Any] = field(default_factory=dict)
     per_frame: list[dict[str, Any]] = field(default_factory=list)
+    after_test_time_pose_refinement: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_bytes: int = 0
     fit: dict[str, Any] = field(default_factory=dict)
@@ -56,6 +59,14 @@ class FitReport:
         kind = self.scored_frames.get("kind", "")
         for name, value in self.metrics.items():
             lines.append(f"  {kind} {name}: " + ("not computed" if value is None else f"{value:.3f}"))
+        again = self.after_test_time_pose_refinement
+        for name, value in again.get("metrics", {}).items():
+            first = again["as_fitted"][name]
+            if value is not None and first is not None:
+                lines.append(
+                    f"  {len(again['frames'])} heldout frames, after test-time pose refinement {name}: "
+                    f"{value:.3f} (as fitted {first:.3f})"
+                )
         return "\n".join(lines)
 
 

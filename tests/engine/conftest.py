@@ -27,5 +27,5 @@ def demo_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def draft_run(demo_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The RUN directory of a draft fit that held out every fourth frame."""
     out = tmp_path_factory.mktemp("run")
-    fit_to_directory(demo_clip, out, FitOptions(preset="draft", holdout=4))
+    fit_to_directory(demo_clip, out, FitOptions(preset="draft", holdout=4, refined_frames=1))
     return out

@@ -23,6 +23,10 @@ def test_run_directory_holds_what_is_promised(draft_run: Path) -> None:
     assert all(index % 4 == 3 for index in report["frames"]["heldout"])
     assert not set(report["frames"]["heldout"]) & set(report["frames"]["fitted"])
     assert report["scored_frames"] == {"kind": "heldout", "count": len(report["frames"]["heldout"])}
+    second = report["after_test_time_pose_refinement"]
+    assert second["frames"] == report["frames"]["heldout"][:1]
+    assert second["as_fitted"]["psnr_hand_on_black"] == report["per_frame"][0]["psnr_hand_on_black"]
+    assert second["metrics"]["psnr_hand_on_black"] >= second["as_fitted"]["psnr_hand_on_black"]
     assert report["warnings"] == []
     assert report["frames"]["not_trusted"] == []
     choice = report["frames"]["choice"]

@@ -82,6 +82,7 @@ def evaluate(options: EvalOptions, tell: Tell) -> DatasetResult:
         scores = score_clip(
             outcome.avatar, outcome.clip, options.lpips, RefineOptions() if options.refine else None
         )
+        scores.write(folder)
         rows.append(OurRow(f"{sid}/{name}", len(outcome.report.frames["fitted"]), scores))
     columns = {
         "psnr": "psnr_hand_on_black",

@@ -93,6 +93,7 @@ def evaluate(options: EvalOptions, tell: Tell) -> DatasetResult:
         scores = score_clip(
             outcome.avatar, outcome.clip, options.lpips, RefineOptions() if options.refine else None
         )
+        scores.write(folder)
         rows.append(OurRow(name, len(outcome.report.frames["fitted"]), scores))
     columns = {"psnr": "psnr_in_mask", "ssim": "ssim_hand_on_black", "lpips": "lpips_alex_01_hand_on_black"}
     return DatasetResult("Hand Appearance", _PROTOCOL, columns, HAND_APPEARANCE, rows)

@@ -36,9 +36,10 @@ from mass_engine.evaluation.datasets.outcome import (
     needs_mano,
 )
 from mass_engine.evaluation.datasets.paper import INTERHAND
-from mass_engine.evaluation.heldout import HeldoutScores, score_frames
+from mass_engine.evaluation.heldout import score_frames
 from mass_engine.evaluation.mesh_raster import mesh_mask
 from mass_engine.evaluation.refine import RefineOptions
+from mass_engine.evaluation.scores import Frame
 from mass_engine.fitting.schedule import schedule_for
 from mass_engine.fitting.trainer import fit_hand
 from mass_engine.fitting.views import View
@@ -112,17 +113,15 @@ def evaluate(options: EvalOptions, tell: Tell) -> DatasetResult:
     result.avatar.save(options.out)
     test = _tested(data)
     tell(f"{len(test)} test pictures")
-    scores = HeldoutScores([], [])
-    for row, sample in enumerate(test):
-        one = score_frames(
+    frames: list[Frame] = [
+        (
             Through(result.avatar, sample.view.camera),
-            [replace(sample.view, index=row)],
-            [replace(sample.pose, betas=result.avatar.shape.betas[None])],
-            options.lpips,
-            RefineOptions() if options.refine else None,
+            replace(sample.view, index=row),
+            replace(sample.pose, betas=result.avatar.shape.betas[None]),
         )
-        scores.as_fitted.extend(one.as_fitted)
-        scores.refined.extend(one.refined)
+        for row, sample in enumerate(test)
+    ]
+    scores = score_frames(frames, options.lpips, RefineOptions() if options.refine else None)
     columns = {
         "psnr": "psnr_hand_on_black",
         "ssim": "ssim_hand_on_black",

@@ -10,7 +10,7 @@ from typing import Any
 
 from mass_engine.errors import EngineError
 from mass_engine.evaluation.datasets.paper import METRICS, PaperRow
-from mass_engine.evaluation.heldout import REFINED, HeldoutScores, number
+from mass_engine.evaluation.heldout import REFINED_LABEL, HeldoutScores, number
 from mass_engine.evaluation.lpips import LpipsSet
 from mass_engine.evaluation.scores import mean_scores
 from mass_engine.pipeline import FitOutcome
@@ -83,7 +83,7 @@ class DatasetResult:
         for own in self.ours:
             for label, rows in (
                 ("ours", own.scores.as_fitted),
-                (f"ours, {REFINED.replace('_', ' ')}", own.scores.refined),
+                (f"ours, {REFINED_LABEL}", own.scores.refined),
             ):
                 if not rows:
                     continue

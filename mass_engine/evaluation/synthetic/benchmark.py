@@ -20,7 +20,7 @@ from mass_engine.evaluation.demo_clip import ClipOptions
 from mass_engine.evaluation.heldout import REFINED, HeldoutScores, number, score_frames
 from mass_engine.evaluation.lpips import LpipsSet
 from mass_engine.evaluation.refine import RefineOptions
-from mass_engine.evaluation.scores import mean_scores
+from mass_engine.evaluation.scores import frames_of, mean_scores
 from mass_engine.evaluation.surfaces import depth_error, normal_error, similarity, surface_distance
 from mass_engine.evaluation.synthetic.scene import FOV, Scene, SceneOptions, TrueFrame
 from mass_engine.fitting.views import View
@@ -119,13 +119,11 @@ def _case(case: str, options: SyntheticOptions) -> CaseResult:
     save_fit(outcome, folder)
     held = [view for view in outcome.clip.views if view.heldout]
     views = [true_view(view, truth[view.index], outcome.avatar.camera) for view in held]
-    poses = [outcome.avatar.frames.pose_of(view.index) for view in held]
-    scores = score_frames(
-        outcome.avatar, views, poses, options.lpips, RefineOptions() if options.refine else None
-    )
+    frames = frames_of(outcome.avatar, views)
+    scores = score_frames(frames, options.lpips, RefineOptions() if options.refine else None)
     geometry = [
         {"index": view.index, **geometry_errors(outcome.avatar, pose, truth[view.index], scene)}
-        for view, pose in zip(views, poses, strict=True)
+        for _, view, pose in frames
     ]
     return CaseResult(case, scores, geometry, outcome.report.seconds.get("fit", 0.0))
 

@@ -15,9 +15,10 @@ from mass_engine.evaluation.baselines import (
     frames_per_second,
 )
 from mass_engine.evaluation.scores import score_view
-from mass_engine.evaluation.splats import projected_tangents
+from mass_engine.evaluation.splats import projected_tangents, steps_of
 from mass_engine.fitting.subject import Shape
 from mass_engine.hand.builtin import load_builtin
+from mass_engine.hand.pose import HandPose
 from mass_engine.raster import RasterOptions, rasterize
 from mass_engine.surfel.inellipse import quat_to_matrix
 from mass_engine.surfel.shading import white_light
@@ -49,6 +50,27 @@ def test_a_baseline_learns_the_look_and_shows_it_in_a_frame_it_has_not_seen(
     twice = fit_baseline(name, hand, 0, effort=0.01)
     one, two = (m.render_pose(hand.pose(0), CAMERA.resized(40, 30)).rgb for m in (again, twice))
     torch.testing.assert_close(one, two)
+
+
+def test_effort_is_how_much_a_baseline_sees(hand: Registered) -> None:
+    assert steps_of(5.0, 100, 1.0) == 500
+    assert steps_of(5.0, 100, 0.3) == 150
+    assert steps_of(1.0, 4, 0.3) == steps_of(1.0, 120, 0.3) == 36  # few frames are seen more often
+    assert steps_of(1.0, 4, 1e-6) == 1
+    seen: list[int] = []
+
+    class Watched(Registered):
+        def pose(self, row: int) -> HandPose:
+            seen.append(row)
+            return super().pose(row)
+
+    def counts(effort: float) -> dict[int, int]:
+        seen.clear()
+        fit_baseline("mesh", Watched(**vars(hand)), 0, effort)
+        return {row: seen.count(row) for row in hand.trained}
+
+    whole, part = counts(1.0), counts(2 / 120)
+    assert [row for row in whole if whole[row] > part[row]] == [1, 3]  # the first and the last are left
 
 
 def test_a_disc_of_a_gaussian_has_its_projected_covariance() -> None:

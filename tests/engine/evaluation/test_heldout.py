@@ -7,14 +7,15 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from mass_engine.avatar import Avatar
+from mass_engine.avatar import Avatar, SourceFrames
 from mass_engine.cli import main
-from mass_engine.evaluation.heldout import FILE_NAME, REFINED
+from mass_engine.evaluation.heldout import FILE_NAME, REFINED, score_refined
 from mass_engine.evaluation.refine import RefineOptions, refine_pose
-from mass_engine.evaluation.scores import score_view, score_view_fully
+from mass_engine.evaluation.scores import Frame, frames_of, mean_scores, score_view, score_view_fully
 from mass_engine.fitting.kinematics import turned
 from mass_engine.hand.pose import HandPose
 from tests.engine.avatars import small_avatar
@@ -61,6 +62,46 @@ def test_refinement_finds_the_pose_again_and_leaves_a_right_one_alone() -> None:
     )
     nothing = refine_pose(avatar, view, wrong, RefineOptions(steps=0))
     torch.testing.assert_close(nothing.hand_pose, wrong.hand_pose)
+
+
+def test_a_few_frames_have_a_second_figure() -> None:
+    poses = true_poses(3)
+    views, avatar = make_views(poses), painted_avatar()
+    frames: list[Frame] = []
+    for row, view in enumerate(views):
+        wrong = turned(one(poses, row), torch.full((1, 51), 0.01))
+        frames.append((avatar, view, wrong))
+    told: list[float] = []
+    found = score_refined(frames, 1, told.append)
+    assert found.frames == [views[0].index]
+    assert found.as_fitted == mean_scores([score_view(*frames[0])])
+    before, after = found.as_fitted["psnr_hand_on_black"], found.metrics["psnr_hand_on_black"]
+    assert before is not None
+    assert after is not None
+    assert after > before + 1
+    assert found.cell() == f"{before:.2f} to {after:.2f}"
+    assert told == [1.0]
+    nothing = score_refined(frames, 0)
+    assert nothing.frames == []
+    assert nothing.cell() == ""
+    assert score_refined([], 4) == nothing
+
+
+def test_a_frame_is_compared_in_its_own_exposure() -> None:
+    poses = true_poses(2)
+    views, avatar = make_views(poses), painted_avatar()
+    frames = SourceFrames(
+        torch.tensor([view.index for view in views]),
+        torch.zeros(2, dtype=torch.bool),
+        poses,
+        torch.tensor([[1.0, 1.0, 1.0], [0.5, 0.5, 0.5]]),
+    )
+    dimmed = replace(avatar, frames=frames)
+    first, second = frames_of(dimmed, views)
+    assert score_view(*first) == pytest.approx(score_view(avatar, views[0], one(poses, 0)), nan_ok=True)
+    dark = replace(views[1], rgb=(views[1].rgb * 0.5).round().astype(np.uint8), _levels={})
+    assert score_view(second[0], dark, second[2])["psnr_in_mask"] > 25
+    assert score_view(avatar, dark, second[2])["psnr_in_mask"] < 20
 
 
 def test_full_scores_hold_the_plain_ones_and_say_what_is_not_computed() -> None:

@@ -90,5 +90,18 @@ def test_curves_and_the_second_figure_are_shown_where_they_are(run: Path) -> Non
         assert text in page.text
 
 
+def test_the_second_figure_of_the_fit_itself_is_shown(run: Path) -> None:
+    report = json.loads((run / "report.json").read_text())
+    report[REFINED] = {
+        "frames": [7, 15],
+        "metrics": dict.fromkeys(report["metrics"], 29.25),
+        "as_fitted": dict.fromkeys(report["metrics"], 28.75),
+    }
+    (run / "report.json").write_text(json.dumps(report))
+    assert main(["report", str(run)]) == 0
+    for text in ("27.000", "28.750 to 29.250", "2 of them, after test-time pose refinement"):
+        assert text in page_of(run).text
+
+
 def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
     assert main(["report", str(tmp_path)]) == 2

@@ -43,7 +43,7 @@ def run(name: str, root: Path, mano: Path, *more: str) -> dict[str, Any]:
     table = (out / "results.md").read_text()
     assert "MASS (paper)" in table
     assert "| ours |" in table
-    assert "| ours, after test time pose refinement |" in table
+    assert "| ours, after test-time pose refinement |" in table
     for row in result["ours"]:
         first, second = row["metrics"], row[REFINED]["metrics"]
         assert first["lpips_vgg_11_hand_on_black"] is None

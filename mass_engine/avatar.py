@@ -51,6 +51,13 @@ class SourceFrames:
 
     def pose_of(self, index: int) -> HandPose:
         """The pose of the frame ``index``. Raises BadArgumentError ``pose.no_such_frame``."""
+        return row_pose(self.pose, self._row(index))
+
+    def gain_of(self, index: int) -> Tensor:
+        """The gain [3] of the frame ``index``. Raises BadArgumentError ``pose.no_such_frame``."""
+        return self.gains[self._row(index)]
+
+    def _row(self, index: int) -> int:
         rows = (self.indices == index).nonzero()
         if len(rows) == 0:
             raise BadArgumentError(
@@ -59,7 +66,7 @@ class SourceFrames:
                 "Use a frame in which the hand was tracked, "
                 f"from {int(self.indices.min())} to {int(self.indices.max())}.",
             )
-        return row_pose(self.pose, int(rows[0]))
+        return int(rows[0])
 
 
 def _sphere(vertices: Tensor) -> tuple[Tensor, float]:

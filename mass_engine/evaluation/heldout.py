@@ -8,11 +8,13 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from mass_engine.avatar import Avatar
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.evaluation.lpips import LpipsSet
 from mass_engine.evaluation.refine import RefineOptions, refine_pose
-from mass_engine.evaluation.scores import Renderable, mean_scores, score_view_fully
+from mass_engine.evaluation.scores import Exposed, Renderable, mean_scores, score_view_fully
 from mass_engine.fitting.report import FILE_NAME as REPORT
 from mass_engine.fitting.views import View
 from mass_engine.hand.pose import HandPose
@@ -69,14 +71,17 @@ def score_frames(
     lpips: LpipsSet | None = None,
     refine: RefineOptions | None = None,
     progress: Callable[[float], None] | None = None,
+    gains: Sequence[Tensor] | None = None,
 ) -> HeldoutScores:
-    """Score ``views`` in their ``poses`` (batches of one), and once more refined if ``refine`` is given."""
+    """Score ``views`` in their ``poses`` (batches of one), and once more refined if ``refine`` is given;
+    ``gains`` ([3] each) by which the frames are brighter than the subject (None: they are not)."""
     rows, again = [], []
     for done, (view, pose) in enumerate(zip(views, poses, strict=True)):
-        rows.append({"index": view.index, **score_view_fully(subject, view, pose, lpips)})
+        shown = subject if gains is None else Exposed(subject, gains[done])
+        rows.append({"index": view.index, **score_view_fully(shown, view, pose, lpips)})
         if refine is not None:
-            better = refine_pose(subject, view, pose, refine)
-            again.append({"index": view.index, **score_view_fully(subject, view, better, lpips)})
+            better = refine_pose(shown, view, pose, refine)
+            again.append({"index": view.index, **score_view_fully(shown, view, better, lpips)})
         if progress is not None:
             progress((done + 1) / len(views))
     return HeldoutScores(rows, again)
@@ -93,9 +98,9 @@ def score_clip(
     held = [view for view in clip.views if view.heldout]
     if not held:
         raise EngineError("eval.no_holdout", "No frame was held out.", "Fit with --holdout 8, say.")
-    return score_frames(
-        avatar, held, [avatar.frames.pose_of(view.index) for view in held], lpips, refine, progress
-    )
+    poses = [avatar.frames.pose_of(view.index) for view in held]
+    gains = [avatar.frames.gain_of(view.index) for view in held]
+    return score_frames(avatar, held, poses, lpips, refine, progress, gains)
 
 
 def evaluate_run(

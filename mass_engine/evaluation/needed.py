@@ -94,8 +94,9 @@ def _size(clip: Clip, name: str, label: str, result: FitResult, seconds: float, 
     held = [view for view in clip.views if view.heldout]
     with one_thread():
         poses = [avatar.frames.pose_of(view.index) for view in held]
-        rows = [score_view(avatar, view, pose) for view, pose in zip(held, poses, strict=True)]
-        squares = [_squared(Comparison.of(avatar, v, p)) for v, p in zip(held, poses, strict=True)]
+        gains = [avatar.frames.gain_of(view.index) for view in held]
+        rows = [score_view(avatar, *frame) for frame in zip(held, poses, gains, strict=True)]
+        squares = [_squared(Comparison.of(avatar, *frame)) for frame in zip(held, poses, gains, strict=True)]
     means = mean_scores(rows)
     ssim = means["ms_ssim_hand_on_black"]
     return Size(

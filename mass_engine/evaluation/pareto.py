@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mass_engine.avatar import SourceFrames
 from mass_engine.evaluation.baselines import (
     BASELINES,
     DESCRIPTIONS,
@@ -32,7 +33,7 @@ from mass_engine.evaluation.heldout import REFINED, number
 from mass_engine.evaluation.refine import refine_pose
 from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.results_file import read_rows, write_results, write_text
-from mass_engine.evaluation.scores import Renderable, Scores, mean_scores, score_view
+from mass_engine.evaluation.scores import Exposed, Renderable, Scores, mean_scores, score_view
 from mass_engine.evaluation.variants import DEFAULT, variants
 from mass_engine.fitting.evidence import spread
 from mass_engine.fitting.schedule import Schedule, schedule_for
@@ -113,7 +114,6 @@ class Bench:
             return
         tell(f"{self.name}: registration for the baselines")
         hand: Registered = register(self.registrations, schedule_for("draft" if self.quick else DEFAULT))
-        poses = {view.index: hand.pose(row) for row, view in enumerate(self.clip.views)}
         for baseline in wanted:
             tell(f"{self.name}: {baseline}")
             start = time.perf_counter()
@@ -123,7 +123,7 @@ class Bench:
                 yield _failed(self.name, "baseline", baseline, error)
                 continue
             seconds = hand.seconds + time.perf_counter() - start
-            yield self._point(fitted, poses, "baseline", baseline, seconds, fitted.size_bytes, 0)
+            yield self._point(fitted, hand.frames, "baseline", baseline, seconds, fitted.size_bytes, 0)
 
     def _ours(self, group: str, label: str, schedule: Schedule) -> Point:
         try:
@@ -134,13 +134,12 @@ class Bench:
         with tempfile.TemporaryDirectory() as folder:
             avatar.save(Path(folder))
             size = sum(path.stat().st_size for path in Path(folder).iterdir())
-        poses = {view.index: avatar.frames.pose_of(view.index) for view in self.clip.views}
-        return self._point(avatar, poses, group, label, seconds, size, avatar.skin.count)
+        return self._point(avatar, avatar.frames, group, label, seconds, size, avatar.skin.count)
 
     def _point(
         self,
         subject: Renderable,
-        poses: dict[int, HandPose],
+        frames: SourceFrames,
         group: str,
         label: str,
         seconds: float,
@@ -150,9 +149,11 @@ class Bench:
         held = [view for view in self.clip.views if view.heldout]
         again = spread(range(len(held)), self.refined_frames) if group in REFINED_GROUPS else []
         with one_thread():
-            rows = [score_view(subject, view, poses[view.index]) for view in held]
-            better = [_refined(subject, held[row], poses[held[row].index]) for row in again]
-            fps = frames_per_second(subject, poses[held[0].index], held[0].camera)
+            shown = [Exposed(subject, frames.gain_of(view.index)) for view in held]
+            poses = [frames.pose_of(view.index) for view in held]
+            rows = [score_view(*frame) for frame in zip(shown, held, poses, strict=True)]
+            better = [_refined(shown[row], held[row], poses[row]) for row in again]
+            fps = frames_per_second(subject, poses[0], held[0].camera)
         before = _kept([rows[row] for row in again])
         place = (self.name, group, label, seconds, fps, size, surfels)
         return Point(*place, _kept(rows), _kept(better), before)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -37,6 +37,24 @@ class Renderable(Protocol):
     def render_pose(self, pose: HandPose, camera: Camera) -> RenderOutput:
         """One pose (a batch of one) over black."""
         ...
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """A ``subject`` as a frame shows it whose colours are brighter by ``gain`` [3]."""
+
+    subject: Renderable
+    gain: Tensor
+
+    @property
+    def camera(self) -> Camera:
+        """The subject's."""
+        return self.subject.camera
+
+    def render_pose(self, pose: HandPose, camera: Camera) -> RenderOutput:
+        """One pose (a batch of one) over black."""
+        out = self.subject.render_pose(pose, camera)
+        return replace(out, rgb=out.rgb * self.gain)
 
 
 @dataclass(frozen=True)

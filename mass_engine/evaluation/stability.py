@@ -2,9 +2,11 @@
 
 Each axis makes one thing worse in steps, on the prepared clip; held-out pictures and masks stay clean, so a
 loss is the fit's. A run fails when it raises, gives numbers that are not finite, or loses more than 3 dB
-against the same method on the clip as it is. Ours and the baselines go on from one registration of each
-changed clip. One seed of every axis comes first, then the next, and the worst level of every axis before
-the others; tables and charts are written after every condition, and --resume goes on.
+against the same method on the clip as it is. Where the exposure drifts, a held-out frame is one of the
+drifting clip's: a render gets the gain that the fit found between its neighbours, and is compared after the
+frame's true one is taken out again. Ours and the baselines go on from one registration of each changed clip,
+under the same gains. One seed of every axis comes first, then the next, and the worst level of every axis
+before the others; tables and charts are written after every condition, and --resume goes on.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from mass_engine.avatar import SourceFrames
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.evaluation import metrics
 from mass_engine.evaluation.baselines import BASELINES, BaselineName, Registered, fit_baseline, register
@@ -29,7 +33,7 @@ from mass_engine.evaluation.perturb import Level, axes
 from mass_engine.evaluation.refine import refine_pose
 from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.results_file import read_rows, write_results, write_text
-from mass_engine.evaluation.scores import Comparison, Renderable, Scores, mean_scores
+from mass_engine.evaluation.scores import Comparison, Exposed, Renderable, Scores, mean_scores
 from mass_engine.evaluation.stability_report import OURS, UNCHANGED, Trial, charts, markdown
 from mass_engine.fitting.schedule import Schedule, schedule_for
 from mass_engine.fitting.views import View
@@ -82,17 +86,16 @@ def trials(clip: Clip, place: Condition, methods: Sequence[str], effort: Effort)
         registrations = Registrations(clip, place.seed + level.reseed, Path(folder))
         hands: list[Registered] = []
 
-        def ours() -> tuple[Renderable, dict[int, HandPose]]:
+        def ours() -> tuple[Renderable, SourceFrames]:
             avatar = registrations.fit(effort.schedule)[0].avatar
-            return avatar, {view.index: avatar.frames.pose_of(view.index) for view in clip.views}
+            return avatar, avatar.frames
 
-        def baseline(name: BaselineName) -> tuple[Renderable, dict[int, HandPose]]:
+        def baseline(name: BaselineName) -> tuple[Renderable, SourceFrames]:
             if not hands:
                 hands.append(register(registrations, effort.schedule))
-            poses = {view.index: hands[0].pose(row) for row, view in enumerate(clip.views)}
-            return fit_baseline(name, hands[0], registrations.seed, effort.baselines), poses
+            return fit_baseline(name, hands[0], registrations.seed, effort.baselines), hands[0].frames
 
-        makers: dict[str, Callable[[], tuple[Renderable, dict[int, HandPose]]]] = {
+        makers: dict[str, Callable[[], tuple[Renderable, SourceFrames]]] = {
             OURS: ours,
             **{name: lambda name=name: baseline(name) for name in BASELINES},  # type: ignore[misc]
         }
@@ -104,30 +107,37 @@ def _trial(
     clip: Clip,
     place: Condition,
     method: str,
-    make: Callable[[], tuple[Renderable, dict[int, HandPose]]],
+    make: Callable[[], tuple[Renderable, SourceFrames]],
     refine: bool,
 ) -> Trial:
     key = (place.clip, place.axis, place.level.value, place.level.name, method, place.seed)
     started = time.perf_counter()
     try:
-        found = _score(*make(), clip, refine)
+        found = score(*make(), clip, place.level, refine)
     except _FAILURES as error:
         spent = round(time.perf_counter() - started, 1)
         return Trial(*key, None, None, None, None, spent, f"{type(error).__name__}: {error}"[:200])
     return Trial(*key, *found, round(time.perf_counter() - started, 1))
 
 
-def _score(
-    subject: Renderable, poses: dict[int, HandPose], clip: Clip, refine: bool
+def score(
+    subject: Renderable, frames: SourceFrames, clip: Clip, level: Level, refine: bool
 ) -> tuple[float | None, float | None, float | None, float | None]:
-    """Mean PSNR in the mask, on black and silhouette IoU; the first again after test-time refinement."""
-    held = [view for view in clip.views if view.heldout]
+    """Mean PSNR in the mask, on black and silhouette IoU; the first again after test-time refinement.
+
+    ``subject`` is rendered in the poses and under the gains of ``frames``, without those of ``level``. Raises
+    ArithmeticError where a score is not finite.
+    """
+    true = torch.from_numpy(level.gains(len(clip.views))).float()
+    rows, again = [], []
     with one_thread():
-        rows = [_scores(subject, view, poses[view.index]) for view in held]
-        again = [
-            _scores(subject, view, refine_pose(subject, view, poses[view.index]))
-            for view in (held if refine else [])
-        ]
+        for row, view in enumerate(clip.views):
+            if view.heldout:
+                shown = Exposed(subject, frames.gain_of(view.index) / true[row])
+                pose = frames.pose_of(view.index)
+                rows.append(_scores(shown, view, pose))
+                if refine:
+                    again.append(_scores(shown, view, refine_pose(shown, view, pose)))
     if not all(math.isfinite(row["psnr"]) for row in rows):
         raise ArithmeticError("a held-out frame has no finite score")
     first, second = mean_scores(rows), mean_scores(again)

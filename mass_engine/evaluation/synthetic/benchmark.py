@@ -121,7 +121,12 @@ def _case(case: str, options: SyntheticOptions) -> CaseResult:
     views = [true_view(view, truth[view.index], outcome.avatar.camera) for view in held]
     poses = [outcome.avatar.frames.pose_of(view.index) for view in held]
     scores = score_frames(
-        outcome.avatar, views, poses, options.lpips, RefineOptions() if options.refine else None
+        outcome.avatar,
+        views,
+        poses,
+        options.lpips,
+        RefineOptions() if options.refine else None,
+        gains=[outcome.avatar.frames.gain_of(view.index) for view in held],
     )
     geometry = [
         {"index": view.index, **geometry_errors(outcome.avatar, pose, truth[view.index], scene)}

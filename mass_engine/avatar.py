@@ -56,6 +56,10 @@ class SourceFrames:
         """The pose of the frame ``index``. Raises BadArgumentError ``pose.no_such_frame``."""
         return row_pose(self.pose, self.row_of(index))
 
+    def gain_of(self, index: int) -> Tensor:
+        """The gain [3] of the frame ``index``. Raises BadArgumentError ``pose.no_such_frame``."""
+        return self.gains[self.row_of(index)]
+
     def row_of(self, index: int) -> int:
         """The row of the frame ``index``. Raises BadArgumentError ``pose.no_such_frame``."""
         rows = (self.indices == index).nonzero()

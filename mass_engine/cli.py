@@ -193,7 +193,11 @@ def _add_components(fit: argparse.ArgumentParser) -> None:
     group = fit.add_argument_group("parts of the method")
     for name, what in COMPONENT_SWITCHES.items():
         group.add_argument(f"--no-{name.replace('_', '-')}", dest=name, action="store_false", help=what)
-    group.add_argument("--exposure", action="store_true", help="a gain per frame and colour channel")
+    group.add_argument(
+        "--exposure",
+        action=argparse.BooleanOptionalAction,
+        help="a gain per frame and colour channel, always or never (without the flag: where frames disagree)",
+    )
     group.add_argument("--binding", choices=BINDINGS, default=Components.binding, help="the binding loss")
     group.add_argument("--levels", type=int, metavar="N", help="Loop levels, 0 to 2")
 
@@ -266,7 +270,7 @@ def _fit(arguments: argparse.Namespace) -> None:
         from_stage=arguments.from_stage,
         components=Components(
             **{name: getattr(arguments, name) for name in COMPONENT_SWITCHES},
-            exposure=arguments.exposure,
+            exposure="auto" if arguments.exposure is None else arguments.exposure,
             binding=arguments.binding,
             levels=arguments.levels,
         ),

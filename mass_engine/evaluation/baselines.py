@@ -25,10 +25,11 @@ from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.scores import Renderable
 from mass_engine.evaluation.splats import BoundSplats, SplatKind, steps_of, train_splats
 from mass_engine.fitting.evidence import spread
+from mass_engine.fitting.exposure import without
 from mass_engine.fitting.schedule import Schedule
 from mass_engine.fitting.subject import Shape, mesh_edges, vertex_normals
 from mass_engine.fitting.trainer import REGISTERED
-from mass_engine.fitting.views import View
+from mass_engine.fitting.views import Level, View
 from mass_engine.hand.pose import HandPose
 from mass_engine.raster import RenderOutput
 from mass_engine.surfel.shading import irradiance_basis
@@ -73,6 +74,10 @@ class Registered:
         """Rows that may be learnt from."""
         return [row for row, view in enumerate(self.views) if not view.heldout]
 
+    def level(self, row: int, side: int) -> Level:
+        """One row's pixels, without the frame's gain."""
+        return without(self.views[row].level(side), self.frames.gains[row])
+
     def pose(self, row: int) -> HandPose:
         """One row's pose (a batch of one)."""
         return self.frames.pose_of(self.views[row].index)
@@ -108,7 +113,7 @@ def fit_baseline(name: BaselineName, hand: Registered, seed: int, effort: float 
     }
     with one_thread():  # sums over threads run in any order: the same seed would give another look
         model = BoundSplats.make(kinds[name], hand.shape, hand.light, hand.camera, seed)
-        train_splats(model, hand.views, hand.trained, hand.pose, seed, effort)
+        train_splats(model, hand.level, hand.trained, hand.pose, seed, effort)
     return model
 
 
@@ -186,7 +191,7 @@ def fit_mesh(
         matrices.append(sp.csr_array(sp.diags_array(off.sum(1)) - off))
         sides[channel] = 0
     for row in spread(hand.trained, steps_of(1.0, len(hand.trained), effort)):
-        level = hand.views[row].level(side)
+        level = hand.level(row, side)
         vertices = mesh.vertices(hand.pose(row))
         shading = irradiance_basis(vertex_normals(vertices, fine.faces)) @ hand.light
         found = rasterize_mesh(vertices.double().numpy(), faces, level.camera, cull=True)

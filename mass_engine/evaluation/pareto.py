@@ -40,7 +40,7 @@ from mass_engine.evaluation.heldout import (
 )
 from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.results_file import read_rows, write_results, write_text
-from mass_engine.evaluation.scores import Frame, Renderable, frames_of, mean_scores, score_view
+from mass_engine.evaluation.scores import Frame, Renderable, frames_of, mean_scores, placed, score_view
 from mass_engine.evaluation.variants import DEFAULT, variants
 from mass_engine.fitting.schedule import Schedule, schedule_for
 from mass_engine.preprocess import Clip
@@ -113,7 +113,7 @@ class Bench:
             return
         tell(f"{self.name}: registration for the baselines")
         hand: Registered = register(self.registrations, schedule_for("draft" if self.quick else DEFAULT))
-        held = [(view, hand.pose(row)) for row, view in enumerate(self.clip.views) if view.heldout]
+        held = [view for view in self.clip.views if view.heldout]
         for baseline in wanted:
             tell(f"{self.name}: {baseline}")
             start = time.perf_counter()
@@ -123,7 +123,7 @@ class Bench:
                 yield _failed(self.name, "baseline", baseline, error)
                 continue
             seconds = hand.seconds + time.perf_counter() - start
-            frames: list[Frame] = [(fitted, view, pose) for view, pose in held]
+            frames = placed(fitted, hand.frames, held)
             yield self._point(fitted, frames, "baseline", baseline, seconds, fitted.size_bytes, 0)
 
     def _ours(self, group: str, label: str, schedule: Schedule) -> Point:

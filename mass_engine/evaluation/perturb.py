@@ -1,5 +1,8 @@
 """What goes wrong with clips, as functions of a prepared clip. Held-out frames keep clean pictures and masks.
 
+An exposure drift is no exception, but their share of it (:attr:`Level.gains`) belongs to them: a render that
+is right there is darker than their clean picture by as much.
+
 Poses are another matter: noise on them is on the held-out ones, too. With *pose noise* the landmarks become
 the noisy poses' own joints, as if a tracker that saw nothing better had given both; with *start noise* they
 stay what the tracker saw.
@@ -34,12 +37,13 @@ Masks = Callable[
 @dataclass(frozen=True)
 class Level:
     """One strength of one perturbation: its place on the axis, its name, and what it does. The fit's own
-    seed is moved by ``reseed``."""
+    seed is moved by ``reseed``; ``gains`` of so many frames [F] are what it does to their exposure."""
 
     value: float
     name: str
     change: Change
     reseed: int = 0
+    gains: Callable[[int], NDArray[np.float64]] = np.ones
 
 
 def axes() -> dict[str, list[Level]]:
@@ -53,7 +57,7 @@ def axes() -> dict[str, list[Level]]:
         "masks punched, holes": [Level(n, f"{n:g}", _masks(_punched(n))) for n in (2, 5, 10)],
         "masks missing, share": [Level(s, f"{s:g}", _missing(s)) for s in (0.1, 0.3, 0.5)],
         "blur, px": [Level(s, f"{s:g}", _blurred(s)) for s in (1, 2, 4)],
-        "exposure drift, stops": [Level(s, f"{s:g}", _exposed(s)) for s in (0.5, 1.0, 2.0)],
+        "exposure drift, stops": [_exposed(s) for s in (0.5, 1.0, 2.0)],
         "occluders": [Level(n, f"{n:g}", _occluded(n)) for n in (1, 2, 4)],
         "frames dropped, share": [Level(s, f"{s:g}", _dropped(s)) for s in (0.3, 0.6, 0.8)],
         "frames fitted": [Level(n, f"{n:g}", _few(n)) for n in (40, 20, 10, 5)],
@@ -177,19 +181,21 @@ def _blurred(sigma: float) -> Change:
     )
 
 
-def _exposed(stops: float) -> Change:
+def _exposed(stops: float) -> Level:
     """The exposure falls and rises again by so many stops over the clip (in code values)."""
 
+    def gains(count: int) -> NDArray[np.float64]:
+        return np.asarray(2 ** (-stops / 2.2 * np.sin(np.pi * np.arange(count) / max(count - 1, 1))))
+
     def change(clip: Clip, _: Random) -> Clip:
-        last = max(len(clip.views) - 1, 1)
+        of = gains(len(clip.views))
 
         def one(row: int, view: View) -> View:
-            gain = 2 ** (-stops / 2.2 * np.sin(np.pi * row / last))
-            return _fresh(view, rgb=(view.rgb * gain).round().clip(0, 255).astype(np.uint8))
+            return _fresh(view, rgb=(view.rgb * of[row]).round().clip(0, 255).astype(np.uint8))
 
         return _on_views(clip, one)
 
-    return change
+    return Level(stops, f"{stops:g}", change, gains=gains)
 
 
 def _occluded(count: float) -> Change:

@@ -292,7 +292,7 @@ def _choices(report: Mapping[str, Any]) -> str:
     """What the fit decided from the clip, and how often it had to step back."""
     fit = report.get("fit", {})
     rows: list[list[object]] = []
-    for part in ("capacity", "deformation"):
+    for part in ("capacity", "deformation", "exposure"):
         rows += [[f"{part}: {name}", _text(value)] for name, value in _flat(fit.get(part, {}))]
     rows += [[name, fit[name]] for name in ("undone_steps", "start_jitter_radians") if name in fit]
     return _table(rows, ["what", "value"])

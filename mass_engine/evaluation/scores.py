@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from mass_engine.avatar import Avatar, row_pose
+from mass_engine.avatar import Avatar, SourceFrames
 from mass_engine.camera import Camera
 from mass_engine.evaluation import metrics
 from mass_engine.evaluation.flip import flip
@@ -41,7 +41,7 @@ class Renderable(Protocol):
 
 @dataclass(frozen=True)
 class Exposed:
-    """``subject`` as a frame with the exposure ``gain`` [3] shows it."""
+    """A ``subject`` as a frame shows it whose colours are brighter by ``gain`` [3]."""
 
     subject: Renderable
     gain: Tensor
@@ -63,11 +63,14 @@ Frame = tuple[Renderable, View, HandPose]
 
 def frames_of(avatar: Avatar, views: Sequence[View]) -> list[Frame]:
     """The avatar in every view's own pose and exposure."""
-    found: list[Frame] = []
-    for view in views:
-        row = avatar.frames.row_of(view.index)
-        found.append((Exposed(avatar, avatar.frames.gains[row]), view, row_pose(avatar.frames.pose, row)))
-    return found
+    return placed(avatar, avatar.frames, views)
+
+
+def placed(subject: Renderable, frames: SourceFrames, views: Sequence[View]) -> list[Frame]:
+    """The ``subject`` in the pose and under the gain that ``frames`` have for every view."""
+    return [
+        (Exposed(subject, frames.gain_of(view.index)), view, frames.pose_of(view.index)) for view in views
+    ]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from torch import Tensor
 from mass_engine.camera import Camera
 from mass_engine.fitting import losses
 from mass_engine.fitting.subject import START_OPACITY, Shape, mesh_edges
-from mass_engine.fitting.views import View
+from mass_engine.fitting.views import Level
 from mass_engine.hand.pose import HandPose
 from mass_engine.raster import RasterOptions, RenderOutput, rasterize
 from mass_engine.surfel.inellipse import quat_to_matrix
@@ -180,13 +180,16 @@ def steps_of(visits: float, frames: int, effort: float) -> int:
 
 def train_splats(
     model: BoundSplats,
-    views: list[View],
+    level_of: Callable[[int, int], Level],
     trained: list[int],
     pose_of: Callable[[int], HandPose],
     seed: int,
     effort: float = 1.0,
 ) -> None:
-    """Adam on every parameter, coarse to fine, with the losses of our own stage two."""
+    """Adam on every parameter, coarse to fine, with the losses of our own stage two.
+
+    ``level_of`` gives the pixels of a row at a side, ``pose_of`` its pose.
+    """
     random = torch.Generator().manual_seed(seed + 2)
     posed = {row: model.vertices(pose_of(row)) for row in trained}
     parameters = {name: value.requires_grad_(True) for name, value in model.parameters().items()}
@@ -204,7 +207,7 @@ def train_splats(
         for group, name in zip(optimizer.param_groups, parameters, strict=True):
             group["lr"] = _RATES[name] * 0.05 ** (step / len(plan))
         optimizer.zero_grad(set_to_none=True)
-        loss = _loss(model, views[row], posed[row], side, random)
+        loss = _loss(model, level_of(row, side), posed[row], random)
         loss.backward()
         if all(value.grad is None or bool(value.grad.isfinite().all()) for value in parameters.values()):
             optimizer.step()
@@ -212,8 +215,7 @@ def train_splats(
         value.requires_grad_(False)
 
 
-def _loss(model: BoundSplats, view: View, vertices: Tensor, side: int, random: torch.Generator) -> Tensor:
-    level = view.level(side)
+def _loss(model: BoundSplats, level: Level, vertices: Tensor, random: torch.Generator) -> Tensor:
     background = torch.rand(3, generator=random)
     out = model.draw(vertices, level.camera, background)
     area = level.hand.sum().clamp_min(16.0)

@@ -2,9 +2,11 @@
 
 Each axis makes one thing worse in steps, on the prepared clip; held-out pictures and masks stay clean, so a
 loss is the fit's. A run fails when it raises, gives numbers that are not finite, or loses more than 3 dB
-against the same method on the clip as it is. Ours and the baselines go on from one registration of each
-changed clip. One seed of every axis comes first, then the next, and the worst level of every axis before
-the others; tables and charts are written after every condition, and --resume goes on.
+against the same method on the clip as it is. Where the exposure drifts, a held-out frame is one of the
+drifting clip's: a render gets the gain that the fit found between its neighbours, and is compared after the
+frame's true one is taken out again. Ours and the baselines go on from one registration of each changed clip,
+under the same gains. One seed of every axis comes first, then the next, and the worst level of every axis
+before the others; tables and charts are written after every condition, and --resume goes on.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from mass_engine.avatar import SourceFrames
 from mass_engine.errors import BadArgumentError, EngineError
 from mass_engine.evaluation import metrics
 from mass_engine.evaluation.arguments import add_refined_frames
@@ -30,7 +34,7 @@ from mass_engine.evaluation.outlines import iou
 from mass_engine.evaluation.perturb import Level, axes
 from mass_engine.evaluation.registrations import Registrations
 from mass_engine.evaluation.results_file import read_rows, write_results, write_text
-from mass_engine.evaluation.scores import Comparison, Frame, Scores, frames_of, mean_scores
+from mass_engine.evaluation.scores import Comparison, Exposed, Frame, Renderable, Scores, mean_scores, placed
 from mass_engine.evaluation.stability_report import OURS, UNCHANGED, Trial, charts, markdown
 from mass_engine.fitting.schedule import Schedule, schedule_for
 from mass_engine.preprocess import Clip
@@ -80,47 +84,62 @@ def trials(clip: Clip, place: Condition, methods: Sequence[str], effort: Effort)
     with tempfile.TemporaryDirectory() as folder:
         registrations = Registrations(clip, place.seed + level.reseed, Path(folder))
         hands: list[Registered] = []
-        held = {row: view for row, view in enumerate(clip.views) if view.heldout}
 
-        def ours() -> list[Frame]:
-            return frames_of(registrations.fit(effort.schedule)[0].avatar, list(held.values()))
+        def ours() -> tuple[Renderable, SourceFrames]:
+            avatar = registrations.fit(effort.schedule)[0].avatar
+            return avatar, avatar.frames
 
-        def baseline(name: BaselineName) -> list[Frame]:
+        def baseline(name: BaselineName) -> tuple[Renderable, SourceFrames]:
             if not hands:
                 hands.append(register(registrations, effort.schedule))
-            fitted = fit_baseline(name, hands[0], registrations.seed, effort.baselines)
-            return [(fitted, view, hands[0].pose(row)) for row, view in held.items()]
+            return fit_baseline(name, hands[0], registrations.seed, effort.baselines), hands[0].frames
 
-        makers: dict[str, Callable[[], list[Frame]]] = {
+        makers: dict[str, Callable[[], tuple[Renderable, SourceFrames]]] = {
             OURS: ours,
             **{name: lambda name=name: baseline(name) for name in BASELINES},  # type: ignore[misc]
         }
         for method in methods:
-            yield _trial(place, method, makers[method], effort.refined)
+            yield _trial(clip, place, method, makers[method], effort.refined)
 
 
-def _trial(place: Condition, method: str, make: Callable[[], list[Frame]], refined: int) -> Trial:
+def _trial(
+    clip: Clip,
+    place: Condition,
+    method: str,
+    make: Callable[[], tuple[Renderable, SourceFrames]],
+    refined: int,
+) -> Trial:
     key = (place.clip, place.axis, place.level.value, place.level.name, method, place.seed)
     started = time.perf_counter()
     try:
-        frames = make()
+        found = make()
         spent = round(time.perf_counter() - started, 1)
-        return Trial(*key, *_score(frames, refined), spent)
+        return Trial(*key, *score(*found, clip, place.level, refined), spent)
     except _FAILURES as error:
         spent = round(time.perf_counter() - started, 1)
         why = f"{type(error).__name__}: {error}"[:200]
         return Trial(*key, None, None, None, seconds=spent, error=why)
 
 
-def _score(
-    frames: Sequence[Frame], refined: int
+def score(
+    subject: Renderable, frames: SourceFrames, clip: Clip, level: Level, refined: int
 ) -> tuple[float | None, float | None, float | None, RefinedScores]:
-    """Mean PSNR in the mask, on black and silhouette IoU of held-out frames, and the second figure."""
+    """Mean PSNR in the mask, on black and silhouette IoU of held-out frames, and the second figure.
+
+    ``subject`` is rendered in the poses and under the gains of ``frames``, without those of ``level``, which
+    the clean pictures do not have. Raises ArithmeticError where a score is not finite.
+    """
+    true = torch.from_numpy(level.gains(len(clip.views))).float()
+    held = [row for row, view in enumerate(clip.views) if view.heldout]
+    found = placed(subject, frames, [clip.views[row] for row in held])
+    shown: list[Frame] = [
+        (Exposed(at, 1 / true[row]), view, pose) for row, (at, view, pose) in zip(held, found, strict=True)
+    ]
     with one_thread():
-        rows = [_scores(frame) for frame in frames]
+        rows = [_scores(frame) for frame in shown]
         if not all(math.isfinite(row["psnr"]) for row in rows):
             raise ArithmeticError("a held-out frame has no finite score")
-        again = score_refined(frames, refined)
+        again = score_refined(shown, refined)
     means = mean_scores(rows)
     return means["psnr"], means["psnr_on_black"], means["iou"], again
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from mass_engine.errors import BadArgumentError
 
 BINDINGS = ("none", "paper", "additive")
+EXPOSURES = ("auto", "on", "off")
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,8 @@ class Components:
     ``densify``: fractal surfels in the corners of the faces. ``detached``: surfels that leave the mesh,
     beside the attached ones; ``deform``: the network that moves and masks them. ``binding``: the loss that
     keeps them near it. ``levels`` of Loop subdivision (None: the preset's). ``refine_pose``: poses,
-    shape and surface of stage one. ``exposure``: a gain per frame and colour channel. ``shading``: the
-    clip's light.
+    shape and surface of stage one. ``exposure``: a gain per frame and colour channel: "on", "off", or "auto"
+    where the clip's frames disagree clearly (True and False mean on and off). ``shading``: the clip's light.
     ``harmonics``: view-dependent colour. ``settle``: stage two moves and sizes attached surfels a little.
     """
 
@@ -27,12 +28,20 @@ class Components:
     binding: str = "additive"
     levels: int | None = None
     refine_pose: bool = True
-    exposure: bool = False
+    exposure: str | bool = "auto"
     shading: bool = True
     harmonics: bool = True
     settle: bool = True
 
     def __post_init__(self) -> None:
+        if isinstance(self.exposure, bool):
+            object.__setattr__(self, "exposure", "on" if self.exposure else "off")
+        if self.exposure not in EXPOSURES:
+            raise BadArgumentError(
+                "options.invalid",
+                f"exposure cannot be {self.exposure!r}.",
+                f"Use one of {', '.join(EXPOSURES)}.",
+            )
         if self.binding not in BINDINGS:
             raise BadArgumentError(
                 "options.invalid",

@@ -52,7 +52,7 @@ def convert(
     skin = Skin.attached(bind(schedule.levels, schedule.depth, thinned))
     rows = spread(scene.trained, schedule.gather_frames)
     evidence = gather(scene, skin, light, schedule.gather_side, rows, progress)
-    if components.exposure:
+    if components.exposure == "on" or bool((scene.gains != 1).any()):
         for _ in range(GAIN_ROUNDS):
             look = Appearance.plain(skin.count, light)
             look.albedo = fill_unseen(evidence, skin, capacity.UNSEEN)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from mass_engine.fitting.exposure import between, without
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.registration import overlap
 from mass_engine.fitting.skin import Skin
@@ -127,12 +128,11 @@ def gather(
     opacities = torch.full((size,), START_OPACITY, device=device)
     for done, row in enumerate(rows):
         with torch.no_grad():
-            level, surfels = scene.level(row, side), scene.surfels(skin, row)
+            level, surfels = without(scene.level(row, side), scene.gains[row]), scene.surfels(skin, row)
         colors = torch.zeros(size, 3, device=device, requires_grad=True)
         out = draw(surfels.row(0), opacities, colors, level.camera, scene.raster)
         cover, usable = level.hand.unsqueeze(-1), level.colored.unsqueeze(-1)
-        picture = level.rgb / scene.gains[row]
-        (seen,) = torch.autograd.grad(out.rgb, colors, picture * cover * usable, retain_graph=True)
+        (seen,) = torch.autograd.grad(out.rgb, colors, level.rgb * cover * usable, retain_graph=True)
         forearm = 1 - level.valid
         kinds = torch.stack([level.hand * level.colored, forearm, (1 - level.hand) * level.valid], -1)
         (weights,) = torch.autograd.grad(out.rgb, colors, kinds)
@@ -157,9 +157,10 @@ def colors_of(scene: Scene, skin: Skin, row: int) -> Tensor:
 
 
 def frame_gains(scene: Scene, skin: Skin, appearance: Appearance, side: int) -> Tensor:
-    """Gains [F,3] by which each frame's hand is brighter than the rendered one; geometric mean 1.
+    """Gains [F,3], beside the scene's, by which each frame's hand is brighter than the rendered one.
 
-    Held-out rows lie between their neighbours in time: their own colours are not looked at.
+    Their geometric mean is 1. Held-out rows lie between their neighbours in time: their own colours are not
+    looked at.
     """
     known = [row for row, view in enumerate(scene.views) if not view.heldout]
     home, scene = scene.device, scene.at_work()
@@ -167,19 +168,13 @@ def frame_gains(scene: Scene, skin: Skin, appearance: Appearance, side: int) -> 
     logs = torch.zeros(len(scene.views), 3, device=scene.device)
     for row in known:
         with torch.no_grad():
-            level = scene.level(row, side)
+            level = without(scene.level(row, side), scene.gains[row])
             out = render_row(appearance, scene.surfels(skin, row), 0, skin.bones, level.camera, scene.raster)
         inner = (level.hand * level.colored * (out.alpha > 0.95)).unsqueeze(-1)
         top, bottom = (inner * level.rgb * out.rgb).sum((0, 1)), (inner * out.rgb.square()).sum((0, 1))
         hold = 0.02 * bottom.mean() + 1e-6
         logs[row] = ((top + hold) / (bottom + hold)).log()
-    logs[known] = logs[known] - logs[known].mean(0)
-    times = torch.tensor([view.time for view in scene.views], dtype=torch.float64)
-    for row, view in enumerate(scene.views):
-        if view.heldout:
-            near = sorted(known, key=lambda other: abs(float(times[other] - times[row])))[:2]
-            logs[row] = logs[near].mean(0)
-    return logs.exp().to(home)
+    return between(logs[known] - logs[known].mean(0), scene.views, known).exp().to(home)
 
 
 def fill_unseen(evidence: Evidence, skin: Skin, least: float) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mass_engine.camera import Camera
+from mass_engine.fitting.exposure import without
 from mass_engine.fitting.kinematics import POSE_SIZE, pose_jacobian, shape_jacobian, turned
 from mass_engine.fitting.light import LightSample, sample_colors, solve_light
 from mass_engine.fitting.poses import PoseTable
@@ -96,6 +97,8 @@ class Registrar:
         self.priors = priors or Priors()
         self.light, self._shading = white_light(), shading
         #: Silhouette overlap [F] and poses [F,...] before each row's last step (overlap 0: none yet).
+        #: How much brighter each frame's colours are [F,3].
+        self.gains = torch.ones(len(views), 3)
         self.memory = {"overlap": torch.zeros(len(views))}
         self.memory |= {name: value.clone() for name, value in table.values.items()}
         self.undone = 0
@@ -143,7 +146,7 @@ class Registrar:
                 attached, jacobian.vertices, hand.bone_transforms[..., :3, :3], hand.joints
             )
             for place, row in enumerate(part):
-                level = self.views[row].level(stage.side)
+                level = without(self.views[row].level(stage.side), self.gains[row])
                 with torch.no_grad():
                     out = render_row(appearance, surfels, place, binding.bones, level.camera, self.raster)
                 skin = jacobian.vertices[place]

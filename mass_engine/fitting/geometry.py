@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mass_engine.camera import Camera
 from mass_engine.fitting import losses
+from mass_engine.fitting.exposure import without
 from mass_engine.fitting.guard import Guard
 from mass_engine.fitting.poses import PoseTable
 from mass_engine.fitting.subject import (
@@ -79,6 +80,8 @@ class GeometryFit:
     ) -> None:
         self.views, self.table, self.shape = views, table, shape
         self.camera, self.raster = camera, raster
+        #: How much brighter each frame's colours are [F,3].
+        self.gains = torch.ones(len(views), 3)
         self.undone = 0
         self._seed = seed
         self._edges = mesh_edges(shape.model.faces)
@@ -160,7 +163,7 @@ class GeometryFit:
         in_camera = surfels.outline_vertices @ camera[:3, :3].T + camera[:3, 3]
         total = torch.zeros(())
         for place, row in enumerate(rows.tolist()):
-            level = self.views[row].level(stage.side)
+            level = without(self.views[row].level(stage.side), self.gains[row])
             background = torch.rand(3, generator=random)
             out = render_row(
                 appearance,

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from mass_engine.device import Precision
 from mass_engine.fitting.components import Components
 from mass_engine.fitting.conversion import convert, deform_surfels, finish, may_settle
 from mass_engine.fitting.evidence import Evidence, Scene, colors_of, fill_unseen, gather, spread
+from mass_engine.fitting.exposure import find_drift
 from mass_engine.fitting.gauss_newton import Registrar, Round
 from mass_engine.fitting.geometry import GeometryFit, GeometryPass
 from mass_engine.fitting.heldout_poses import place_heldout
@@ -95,6 +97,7 @@ class Trainer:
         self.scene = Scene(
             self.views, state.table, state.shape, self.raster, state.gains, validation, self.device
         )
+        self.geometry.gains = self.registrar.gains = state.gains
 
     def bind(self, levels: int, depth: int, widened: bool = False) -> MeshBinding:
         """A binding of the hand's mesh (kept for the next call)."""
@@ -142,7 +145,8 @@ class Trainer:
         steps = self.steps()
         prints = self._fingerprints() if checkpoint is not None else ("", "")
         if checkpoint is not None and self.state.load(checkpoint, prints):
-            self.registrar.light, self.scene.gains = self.state.light, self.state.gains
+            self.registrar.light = self.state.light
+            self.scene.gains = self.registrar.gains = self.geometry.gains = self.state.gains
             self.registrar.memory = self.state.memory or self.registrar.memory
             self.state.notes["resumed_after"] = self.state.steps[-1]
         total, done = sum(share for _, share, _ in steps), 0.0
@@ -165,7 +169,8 @@ class Trainer:
     def _fingerprints(self) -> tuple[str, str]:
         """Of what the registration depends on, and of everything."""
         s, parts = self.schedule, self.components
-        early = f"{s.geometry} {s.outline} {s.texture} {s.validate_every} {parts.shading} {self.seed}"
+        early = f"{s.geometry} {s.outline} {s.texture} {s.validate_every} {parts.shading} {self.seed} "
+        early += f"{parts.exposure}"
         start = fingerprint_of(self.views, self.start.hand_pose, early)
         return start, fingerprint_of([], self.start.hand_pose, f"{start} {s} {parts}")
 
@@ -311,12 +316,12 @@ def fit_hand(
     noise = float(jitter(start).max())
     if components.refine_pose:
         start = steadied(start)
-    state = FitState(
-        PoseTable(start), Shape.mean(model, start.betas[0]), white_light(), torch.ones(len(views), 3)
-    )
+    gains, exposure = _exposure(views, start, model, camera, components.exposure)
+    state = FitState(PoseTable(start), Shape.mean(model, start.betas[0]), white_light(), gains)
     device = device or torch.device("cpu")
     trainer = Trainer(views, state, camera, schedule, components, seed, start, show, device, precision)
     state.notes["start_jitter_radians"] = round(noise, 4)
+    state.notes["exposure"] = exposure
     with one_thread():  # thousands of small operators; the rasteriser has threads of its own
         trainer.run(progress, checkpoint)
     evidence = state.evidence
@@ -333,6 +338,21 @@ def fit_hand(
     )
     avatar = Avatar(state.shape, skin, appearance, camera, frames, _best_frame(views))
     return FitResult(avatar, state, evidence, trimmed, int((evidence.hand < 0.5).sum()))
+
+
+def _exposure(
+    views: list[View], start: HandPose, model: HandModel, camera: Camera, wanted: str | bool
+) -> tuple[Tensor, dict[str, Any]]:
+    """The gains [F,3] that a fit begins with (ones in steady light), and what the report says of them."""
+    drift = None
+    if wanted != "off":
+        with one_thread():
+            drift = find_drift(views, start, model, camera)
+    if drift is None:
+        return torch.ones(len(views), 3), {"drift_stops": None, "seen_in": None, "gains": False}
+    taken = drift.certain or wanted == "on"
+    gains = drift.gains if taken else torch.ones(len(views), 3)
+    return gains, {"drift_stops": round(drift.stops, 3), "seen_in": drift.seen_in, "gains": taken}
 
 
 def _cost(turn: Round) -> float:

@@ -127,7 +127,7 @@ def test_switches_reach_the_fit(demo_clip: Path, tmp_path: Path) -> None:
     parts = report["options"]["components"]
     assert parts["levels"] == 0
     assert parts["binding"] == "paper"
-    assert parts["exposure"]
+    assert parts["exposure"] == "on"
     assert not parts["refine_pose"]
     assert parts["densify"]
     assert report["fit"]["capacity"]["levels"] == 0

@@ -40,6 +40,7 @@ from mass_engine.evaluation.heldout import score_frames
 from mass_engine.evaluation.mesh_raster import mesh_mask
 from mass_engine.evaluation.refine import RefineOptions
 from mass_engine.evaluation.scores import Frame
+from mass_engine.fitting.components import Components
 from mass_engine.fitting.schedule import schedule_for
 from mass_engine.fitting.trainer import fit_hand
 from mass_engine.fitting.views import View
@@ -106,8 +107,11 @@ def evaluate(options: EvalOptions, tell: Tell) -> DatasetResult:
         torch.cat([sample.pose.transl for sample in train]),
         "right",
     )
+    # Pictures of many cameras are not one clip whose exposure drifts.
+    parts = Components(exposure="off")
+    schedule = schedule_for(options.preset)
     result = fit_hand(
-        views, start, data.model, views[0].camera, schedule_for(options.preset), options.seed, lambda *_: None
+        views, start, data.model, views[0].camera, schedule, options.seed, lambda *_: None, parts
     )
     options.out.mkdir(parents=True, exist_ok=True)
     result.avatar.save(options.out)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
@@ -34,6 +37,21 @@ def hand() -> Registered:
     )
     shape = Shape.mean(load_builtin("right"), torch.zeros(10))
     return Registered(views, shape, white_light(), CAMERA, frames, 0.0)
+
+
+def test_a_baseline_learns_from_frames_without_their_gains(hand: Registered) -> None:
+    gains = torch.linspace(0.6, 1.0, 5).unsqueeze(-1).expand(5, 3)
+    dark = [
+        replace(view, rgb=(view.rgb * gains[row].numpy()).round().astype(np.uint8), _levels={})
+        for row, view in enumerate(hand.views)
+    ]
+    known = replace(hand, views=dark, frames=replace(hand.frames, gains=gains))
+    for name in ("mesh", "surfels-vertices"):
+        one, two, spoilt = (
+            fit_baseline(name, given, 0, effort=0.03).render_pose(hand.pose(2), CAMERA).rgb
+            for given in (hand, known, replace(known, frames=hand.frames))
+        )
+        assert float((one - two).abs().mean()) < 0.2 * float((one - spoilt).abs().mean()), name
 
 
 @pytest.mark.parametrize("name", BASELINES)

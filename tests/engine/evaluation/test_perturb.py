@@ -8,13 +8,20 @@ import numpy as np
 import pytest
 import torch
 
+from mass_engine.avatar import SourceFrames
+from mass_engine.camera import Camera
 from mass_engine.evaluation.perturb import axes
+from mass_engine.evaluation.stability import score
+from mass_engine.fitting.subject import Shape, pose_surfels, render_row
 from mass_engine.frame_choice import FrameChoice
 from mass_engine.hand.builtin import load_builtin
+from mass_engine.hand.pose import HandPose
 from mass_engine.preprocess import Clip
+from mass_engine.raster import RasterOptions, RenderOutput
+from mass_engine.surfel.binding import MeshBinding
 from mass_engine.tracking.segmentation import BACKGROUND, HAND, IGNORE
 from mass_engine.video.reader import VideoInfo
-from tests.engine.fitting.clips import CAMERA, make_views, true_poses
+from tests.engine.fitting.clips import CAMERA, make_views, painted, true_poses
 
 FRAMES, HELD = 12, frozenset({3, 7})
 
@@ -89,6 +96,41 @@ def test_pictures(clip: Clip) -> None:
     light = [view.rgb.mean() / old.rgb.mean() for view, old in zip(drift, clip.views, strict=True)]
     assert abs(light[0] - 1) < 0.01
     assert light[6] < 0.6
+    given = next(level for level in axes()["exposure drift, stops"] if level.name == "2").gains(FRAMES)
+    known = [row for row in range(FRAMES) if row not in HELD]
+    np.testing.assert_allclose(np.array(light)[known], given[known], atol=0.01)
+    assert all((level.gains(FRAMES) == 1).all() for level in axes()["blur, px"])
+
+
+class Painted:
+    """The clip's own hand, a little too dark."""
+
+    camera = CAMERA
+
+    def render_pose(self, pose: HandPose, camera: Camera) -> RenderOutput:
+        binding = MeshBinding.build(load_builtin("right"), 1, 1)
+        surfels = pose_surfels(Shape.mean(load_builtin("right"), torch.zeros(10)), binding, pose)
+        options = RasterOptions(cull_backfaces=True)
+        with torch.no_grad():
+            out = render_row(painted(binding), surfels, 0, binding.bones, camera, options)
+        return replace(out, rgb=0.97 * out.rgb)
+
+
+def test_a_drift_is_scored_at_the_exposure_that_the_fit_found(clip: Clip) -> None:
+    level = next(level for level in axes()["exposure drift, stops"] if level.name == "2")
+    drifted = level.change(clip, np.random.default_rng(0))
+    true = torch.from_numpy(level.gains(FRAMES)).float().unsqueeze(-1).expand(-1, 3)
+    held = torch.tensor([view.heldout for view in clip.views])
+    frames = SourceFrames(torch.arange(FRAMES), held, clip.start, true)
+    steady = replace(frames, gains=torch.ones(FRAMES, 3))
+    best = score(Painted(), steady, clip, axes()["exposure drift, stops"][0], 0)
+    right = score(Painted(), frames, drifted, level, 0)
+    wrong = score(Painted(), steady, drifted, level, 0)
+    assert best[0] is not None
+    assert best[0] > 25
+    assert right == pytest.approx(best)
+    assert wrong[0] is not None
+    assert wrong[0] < best[0] - 10
 
 
 def test_frames_and_poses(clip: Clip) -> None:

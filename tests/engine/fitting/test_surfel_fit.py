@@ -124,6 +124,11 @@ def test_gains_find_the_exposure_of_every_frame_but_the_heldout() -> None:
     known = [row for row in range(8) if row != 4]
     torch.testing.assert_close(found[known], true[known] - true[known].mean(), atol=0.05, rtol=0)
     assert abs(float(found[4] - (found[3] + found[5]) / 2)) < 1e-5, "between its neighbours"
+    # What is found is beside what is known: nothing is left once the colours are without their gains.
+    scene.gains = frame_gains(scene, skin, look, 200)
+    skin, look = started(scene)
+    rest = frame_gains(scene, skin, look, 200).log()
+    assert float(rest.abs().max()) < 0.2 * float(true.abs().max())
 
 
 def test_a_pick_of_detached_surfels_leaves_the_skin_as_it_is() -> None:

@@ -182,7 +182,7 @@ def test_every_part_can_be_switched_off(parts: Components) -> None:
     assert (len(avatar.skin.detached) > 0) == parts.detached
     assert (avatar.skin.deformation is not None) == (parts.detached and parts.deform)
     assert torch.equal(avatar.frames.pose.hand_pose, start.hand_pose) == (not parts.refine_pose)
-    assert bool((avatar.frames.gains != 1).any()) == parts.exposure
+    assert bool((avatar.frames.gains != 1).any()) == (parts.exposure == "on")
     assert torch.equal(avatar.appearance.light, white_light()) == (not parts.shading)
     assert (avatar.appearance.sh.shape[1] > 0) == parts.harmonics
     assert (avatar.skin.static is not None and bool(avatar.skin.static.offset.any())) == parts.settle

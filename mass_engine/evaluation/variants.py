@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from mass_engine.fitting.schedule import Schedule, schedule_for
+from mass_engine.fitting.schedule import Schedule, schedule_for, unsettled
 from mass_engine.options import PRESETS
 
 DEFAULT = "auto"
@@ -48,6 +48,11 @@ def variants(quick: bool) -> dict[str, dict[str, Schedule]]:
         "every surfel, deformation": replace(base, adaptive=False),
         "every surfel, no deformation": plain,
         "as needed, no deformation": replace(base, detached=False, deforming=()),
+    }
+    groups["parts"] = {
+        "attached surfels stay": unsettled(base),
+        "no corners filled": replace(base, depth=0),
+        "one colour from every side": replace(base, harmonics=0),
     }
     groups["registration"] = {
         "no texture rounds": replace(base, texture=()),

@@ -38,20 +38,24 @@ CONSENSUS = 0.6
 #: Radius of the disc that must fit into a covered region, hand sizes, by the step it is looked for before:
 #: as large as poses may still be wrong.
 LOOKS = {
-    "stage 1, 96 px": 0.045,
-    "stage 1, outline": 0.03,
-    "stage 1, sweep": 0.02,
-    "stage 1, texture 1": 0.02,
+    "stage 1, 96 px": 0.035,
+    "stage 1, outline": 0.025,
+    "stage 1, sweep": 0.018,
+    "stage 1, texture 1": 0.018,
     "conversion": 0.016,
 }
+#: How much wider a region must be that reaches the render's outline.
+AT_RIM = 1.25
 #: Least radius of the disc, pixels of ``SIDE``.
 LEAST_RADIUS = 2.5
 #: Joints farther than this from their landmarks are astray, hand sizes.
-ASTRAY = 0.05
-#: Bare hand counts from so many radii of thickness, up to so far from a region in radii, and from this share
-#: of the region's pixels.
+ASTRAY = 0.08
+#: What of a hand a joint takes along, hand sizes squared: a finger's width by the length of a segment.
+SEGMENT = 0.011
+#: Bare hand counts from so many radii of thickness, up to so many radii from a region at the rim, and from
+#: this share of the region's pixels.
 BARE, BESIDE, BARE_SHARE = 0.4, 4.0, 0.3
-#: A frame of whose hand more than this is bare is misplaced altogether, and says nothing.
+#: A frame of whose hand more than this share is bare is misplaced altogether, and says nothing.
 MISPLACED = 0.08
 #: How far beyond a covered region nothing is known either, hand sizes.
 MARGIN = 0.015
@@ -62,21 +66,22 @@ Points = NDArray[np.float32]
 
 
 def covered_pixels(
-    level: Level, drawn: Mask, known: Mask, astray: Points, radius: float, margin: float
+    level: Level, drawn: Mask, known: Mask, astray: Points, radius: float, size: float
 ) -> Mask:
-    """What of a frame's background is hand that something covers, and ``margin`` pixels around it [h,w].
+    """What of a frame's background is hand that something covers, and a margin around it [h,w].
 
     ``drawn`` [h,w]: the rendered hand; ``known``: where it is skin that the frames agree on; ``astray``
     [P,2]: pixels of joints that are not where the landmarks are. A disc of ``radius`` pixels must fit into a
-    region: gaps between fingers, and what a pose misses, are narrower.
+    region: gaps between fingers, and what a pose misses, are narrower. ``size`` of the hand in pixels.
     """
     hand = level.hand.numpy() > 0.5
     background = ~hand & (level.valid.numpy() > 0.5)
     missing = drawn & known & background
     # Opened by the disc: without the slivers along outlines that hang on.
     region = _opened(missing, radius)
-    # Hand that the render leaves bare right beside a region, and a joint that should be elsewhere: the
-    # finger is not covered, it is misplaced.
+    # Hand that the render leaves bare right beside a region: the finger is not covered, it is misplaced. So
+    # it is where a region at the render's outline is narrow, or no larger than joints that should be
+    # elsewhere explain.
     bare = _opened(hand & ~drawn, BARE * radius)
     if bare.sum() > MISPLACED * hand.sum():
         return np.zeros_like(hand)
@@ -84,10 +89,16 @@ def covered_pixels(
     for part in range(1, count):
         own = parts == part
         near = _distance(own)
-        beside = bare & (near <= BESIDE * radius)
-        if beside.sum() > BARE_SHARE * own.sum() or _touches(near, astray, radius + margin):
+        at_rim = _distance(~drawn)[own].min() <= radius
+        beside = bare & (near <= (BESIDE * radius if at_rim else radius))
+        elsewhere = beside.sum() > BARE_SHARE * own.sum()
+        if at_rim and not elsewhere:
+            narrow = not _opened(own, AT_RIM * radius).any()
+            joints = _touching(near, astray, radius + MARGIN * size)
+            elsewhere = narrow or own.sum() < joints * SEGMENT * size**2
+        if elsewhere:
             region &= ~own
-    return _within(region, margin) & background
+    return _within(region, MARGIN * size) & background
 
 
 def _opened(mask: Mask, radius: float) -> Mask:
@@ -106,11 +117,11 @@ def _distance(mask: Mask) -> NDArray[np.float32]:
     return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
 
 
-def _touches(distances: NDArray[np.float32], points: Points, reach: float) -> bool:
+def _touching(distances: NDArray[np.float32], points: Points, reach: float) -> int:
     height, width = distances.shape
     columns, rows = np.floor(points).astype(int).T
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    return bool((distances[rows[inside], columns[inside]] <= reach).any())
+    return int((distances[rows[inside], columns[inside]] <= reach).sum())
 
 
 def find_covered(
@@ -160,7 +171,7 @@ def _covered_of(scene: Scene, skin: Skin, camera: Camera, row: int, radius: floa
         np.asarray(share > CONSENSUS * alpha),
         at[0, apart > ASTRAY].numpy(),
         max(LEAST_RADIUS, radius * size),
-        MARGIN * size,
+        size,
     )
 
 

@@ -51,17 +51,17 @@ NONE = np.zeros((0, 2), np.float32)
 
 def test_a_thing_before_the_hand_is_covered_hand() -> None:
     thing = box(50, 50, 75, 70)
-    marked = covered_pixels(level_of(PALM & ~thing), PALM, KNOWN, NONE, 5.0, 3.0)
+    marked = covered_pixels(level_of(PALM & ~thing), PALM, KNOWN, NONE, 5.0, 160.0)
     assert (marked & thing).sum() > 0.97 * thing.sum()
     assert not (marked & ~thing).any()  # what the mask calls hand is hand
 
 
 def test_a_thing_over_the_rim_is_ignored_a_little_beyond_it() -> None:
     thing = box(80, 40, 115, 60)
-    marked = covered_pixels(level_of(PALM & ~thing), PALM, KNOWN, NONE, 5.0, 3.0)
+    marked = covered_pixels(level_of(PALM & ~thing), PALM, KNOWN, NONE, 5.0, 160.0)
     assert (marked & thing & PALM).sum() > 0.95 * (thing & PALM).sum()
-    assert marked[:, 102].any()
-    assert not marked[:, 104:].any()
+    assert marked[:, 101].any()
+    assert not marked[:, 103:].any()
 
 
 @pytest.mark.parametrize(
@@ -76,18 +76,24 @@ def test_a_thing_over_the_rim_is_ignored_a_little_beyond_it() -> None:
     ids=["gap", "rim", "unknown", "ring", "finger"],
 )
 def test_what_a_pose_may_have_wrong_stays(mask: Mask, drawn: Mask, known: Mask) -> None:
-    assert not covered_pixels(level_of(mask), drawn, known, NONE, 5.0, 3.0).any()
+    assert not covered_pixels(level_of(mask), drawn, known, NONE, 5.0, 160.0).any()
 
 
 def test_a_finger_elsewhere_is_told_from_a_finger_covered() -> None:
     palm, here, there = box(20, 50, 100, 110), box(30, 10, 50, 50), box(60, 10, 80, 50)
     known = KNOWN
-    assert not covered_pixels(level_of(palm | there), palm | here, known, NONE, 5.0, 3.0).any()
-    assert covered_pixels(level_of(palm), palm | here, known, NONE, 5.0, 3.0).any()
-    tip = np.array([[40.0, 14.0]], np.float32)  # its landmark is not there
-    assert not covered_pixels(level_of(palm), palm | here, known, tip, 5.0, 3.0).any()
+    assert not covered_pixels(level_of(palm | there), palm | here, known, NONE, 5.0, 160.0).any()
+    assert covered_pixels(level_of(palm), palm | here, known, NONE, 5.0, 160.0).any()
+    joints = np.array([[40.0, 14.0], [40.0, 28.0], [40.0, 42.0]], np.float32)  # landmarks are elsewhere
+    assert not covered_pixels(level_of(palm), palm | here, known, joints, 5.0, 160.0).any()
+    assert covered_pixels(level_of(palm), palm | here, known, joints[:1], 5.0, 160.0).any()
+    slim = box(30, 38, 50, 50)  # a finger that is bent: the render's is longer by less than its width
+    assert not covered_pixels(level_of(palm), palm | slim, known, NONE, 5.0, 160.0).any()
+    assert covered_pixels(level_of(palm), palm | slim, known, NONE, 3.5, 160.0).any()
+    inner = np.array([[62.0, 60.0]], np.float32)  # no outline could hide that one
+    assert covered_pixels(level_of(PALM & ~box(50, 50, 75, 70)), PALM, known, inner, 5.0, 160.0).any()
     far = np.array([[90.0, 90.0], [500.0, -3.0]], np.float32)
-    assert covered_pixels(level_of(palm), palm | here, known, far, 5.0, 3.0).any()
+    assert covered_pixels(level_of(palm), palm | here, known, far, 5.0, 160.0).any()
 
 
 def things_before(view: View, seed: int) -> View:
@@ -218,4 +224,4 @@ def test_a_covered_hand_is_fitted_nearly_as_well() -> None:
         rows = [score_view(avatar, views[row], avatar.frames.pose_of(views[row].index)) for row in held]
         return min(row["psnr_in_mask"] for row in rows)
 
-    assert score(spoilt_views()) > score(clean_views()) - 1.5
+    assert score(spoilt_views()) > score(clean_views()) - 0.8  # 1.2 when nothing is ignored

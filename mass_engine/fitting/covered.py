@@ -49,7 +49,7 @@ AT_RIM = 1.25
 #: Least radius of the disc, pixels of ``SIDE``.
 LEAST_RADIUS = 2.5
 #: Joints farther than this from their landmarks are astray, hand sizes.
-ASTRAY = 0.08
+ASTRAY = 0.05
 #: What of a hand a joint takes along, hand sizes squared: a finger's width by the length of a segment.
 SEGMENT = 0.011
 #: Bare hand counts from so many radii of thickness, up to so many radii from a region at the rim, and from

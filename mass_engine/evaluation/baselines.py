@@ -93,7 +93,7 @@ def register(registrations: Registrations, schedule: Schedule) -> Registered:
     result, seconds = registrations.fit(bare)
     avatar = result.avatar
     return Registered(
-        registrations.clip.views,
+        result.views,
         avatar.shape,
         avatar.appearance.light,
         registrations.clip.camera,

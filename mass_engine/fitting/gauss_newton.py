@@ -200,7 +200,7 @@ class Registrar:
 
     def forget(self, rows: list[int]) -> None:
         """Rows that were placed anew have no last step."""
-        self.memory["overlap"][torch.tensor(rows)] = 0.0
+        self.memory["overlap"][torch.tensor(rows, dtype=torch.long)] = 0.0
 
     def poses(self, rows: list[int]) -> HandPose:
         """The rows' poses as they stand (batched)."""

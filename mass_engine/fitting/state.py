@@ -31,7 +31,8 @@ _EVIDENCE = ("hand", "ignored", "background", "albedo")
 class FitState:
     """``steps`` finished; poses, shape, ``light`` [9,3], ``gains`` [F,3]; from the conversion on the surfels.
 
-    ``memory`` is the registration's (each row's last step); ``notes`` is plain data for the report
+    ``memory`` is the registration's (each row's last step); ``covered`` are pixels of rows that are ignored
+    beside those of the mask, as packed bits; ``notes`` is plain data for the report
     (decisions, validation figures, seconds).
     """
 
@@ -44,6 +45,7 @@ class FitState:
     appearance: Appearance | None = None
     evidence: Evidence | None = None
     memory: dict[str, Tensor] = field(default_factory=dict)
+    covered: dict[int, Tensor] = field(default_factory=dict)
     notes: dict[str, Any] = field(default_factory=dict)
 
     def surfels(self) -> tuple[Skin, Appearance]:
@@ -62,6 +64,7 @@ class FitState:
             "gains": self.gains,
         }
         tensors |= {f"memory.{name}": value for name, value in self.memory.items()}
+        tensors |= {f"covered.{row}": bits for row, bits in self.covered.items()}
         metadata: dict[str, Any] = {"fingerprints": fingerprints, "steps": self.steps, "notes": self.notes}
         if self.appearance is not None and self.skin is not None:
             tensors |= {f"appearance.{name}": getattr(self.appearance, name) for name in _APPEARANCE}
@@ -121,6 +124,11 @@ class FitState:
             name.removeprefix("memory."): value
             for name, value in tensors.items()
             if name.startswith("memory.")
+        }
+        self.covered = {
+            int(name.removeprefix("covered.")): bits
+            for name, bits in tensors.items()
+            if name.startswith("covered.")
         }
         if "evidence.hand" in tensors:
             self.evidence = Evidence(*(tensors[f"evidence.{name}"] for name in _EVIDENCE))

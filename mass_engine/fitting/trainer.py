@@ -17,6 +17,7 @@ from mass_engine.deform.static import StaticResiduals
 from mass_engine.device import Precision
 from mass_engine.fitting.components import Components
 from mass_engine.fitting.conversion import convert, deform_surfels, finish, may_settle
+from mass_engine.fitting.covered import LOOKS, CoveredMasks
 from mass_engine.fitting.evidence import Evidence, Scene, colors_of, fill_unseen, gather, spread
 from mass_engine.fitting.exposure import find_drift
 from mass_engine.fitting.gauss_newton import Registrar, Round
@@ -54,13 +55,15 @@ Progressed = Callable[[float], None]
 
 @dataclass(frozen=True)
 class FitResult:
-    """The avatar and what the fit knows about itself. ``table`` rows follow the views given."""
+    """The avatar and what the fit knows about itself; ``views`` are those given, with what covers the hand
+    ignored."""
 
     avatar: Avatar
     state: FitState
     evidence: Evidence
     trimmed: int
     unseen: int
+    views: list[View]
 
 
 @dataclass
@@ -86,6 +89,7 @@ class Trainer:
     def __post_init__(self) -> None:
         self.raster = RasterOptions(cull_backfaces=True)
         state = self.state
+        self.views = list(self.views)  # what covers the hand is ignored in them, not in the caller's
         self.geometry = GeometryFit(self.views, state.table, state.shape, self.camera, self.seed, self.raster)
         self.registrar = Registrar(
             self.views, state.table, state.shape, self.camera, self.raster, shading=self.components.shading
@@ -98,6 +102,7 @@ class Trainer:
             self.views, state.table, state.shape, self.raster, state.gains, validation, self.device
         )
         self.geometry.gains = self.registrar.gains = state.gains
+        self.covered = CoveredMasks(self.scene, state, self.camera)
 
     def bind(self, levels: int, depth: int, widened: bool = False) -> MeshBinding:
         """A binding of the hand's mesh (kept for the next call)."""
@@ -149,12 +154,14 @@ class Trainer:
             self.scene.gains = self.registrar.gains = self.geometry.gains = self.state.gains
             self.registrar.memory = self.state.memory or self.registrar.memory
             self.state.notes["resumed_after"] = self.state.steps[-1]
+            self.covered.take_up()
         total, done = sum(share for _, share, _ in steps), 0.0
         seconds = self.state.notes.setdefault("seconds", {})
         for number, (name, share, work) in enumerate(steps):
             if number >= len(self.state.steps):
                 begin, started, undone = done / total, time.perf_counter(), self.registrar.undone
                 progress(begin, name)
+                self.registrar.forget(self.covered.before(name, self.bind))
                 work(lambda f, b=begin, s=share, n=name: progress(b + s / total * f, n))  # type: ignore[misc]
                 seconds[name] = round(seconds.get(name, 0.0) + time.perf_counter() - started, 2)
                 taken_back = self.state.notes.get("poses_taken_back", 0) + self.registrar.undone - undone
@@ -170,7 +177,7 @@ class Trainer:
         """Of what the registration depends on, and of everything."""
         s, parts = self.schedule, self.components
         early = f"{s.geometry} {s.outline} {s.texture} {s.validate_every} {parts.shading} {self.seed} "
-        early += f"{parts.exposure}"
+        early += f"{parts.exposure} {LOOKS}"
         start = fingerprint_of(self.views, self.start.hand_pose, early)
         return start, fingerprint_of([], self.start.hand_pose, f"{start} {s} {parts}")
 
@@ -337,7 +344,7 @@ def fit_hand(
         trainer.scene.gains,
     )
     avatar = Avatar(state.shape, skin, appearance, camera, frames, _best_frame(views))
-    return FitResult(avatar, state, evidence, trimmed, int((evidence.hand < 0.5).sum()))
+    return FitResult(avatar, state, evidence, trimmed, int((evidence.hand < 0.5).sum()), trainer.views)
 
 
 def _exposure(

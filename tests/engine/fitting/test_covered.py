@@ -224,4 +224,4 @@ def test_a_covered_hand_is_fitted_nearly_as_well() -> None:
         rows = [score_view(avatar, views[row], avatar.frames.pose_of(views[row].index)) for row in held]
         return min(row["psnr_in_mask"] for row in rows)
 
-    assert score(spoilt_views()) > score(clean_views()) - 0.8  # 1.2 when nothing is ignored
+    assert score(spoilt_views()) > score(clean_views()) - 1.5  # 3.0 when nothing is ignored

@@ -294,6 +294,8 @@ def _choices(report: Mapping[str, Any]) -> str:
     rows: list[list[object]] = []
     for part in ("capacity", "deformation", "exposure"):
         rows += [[f"{part}: {name}", _text(value)] for name, value in _flat(fit.get(part, {}))]
+    last = list(fit.get("covered", {}).values())[-1:]  # what is ignored in the end
+    rows += [[f"covered by something: {name}", _text(value)] for look in last for name, value in look.items()]
     rows += [[name, fit[name]] for name in ("undone_steps", "start_jitter_radians") if name in fit]
     return _table(rows, ["what", "value"])
 

@@ -153,7 +153,7 @@ def evaluate_run(
 ) -> HeldoutScores:
     """Score the held-out frames of the RUN directory of a fit of ``video``, and write RUN/evaluation.json.
 
-    The crops and masks are made again from the run's own tracks. Raises ``eval.no_run``, ``eval.other_video``
+    The crops and masks are made again as the fit made them. Raises ``eval.no_run``, ``eval.other_video``
     and what reading a video raises.
     """
     report = read_report(run)
@@ -191,10 +191,13 @@ def read_report(run: Path) -> dict[str, Any]:
 
 
 def _options(report: dict[str, Any], run: Path, masks: Path | None) -> FitOptions:
-    """The run's own options, with its tracks instead of the tracker's."""
+    """The run's own options. Masks hang on where the hand was tracked: they are those of the fit again where
+    the tracker found it; otherwise (given tracks, one of two hands) the run's own tracks come nearest."""
     known = {item.name for item in fields(FitOptions)}
     given = {name: value for name, value in report["options"].items() if name in known}
     for name in ("masks", "segmenter_weights"):
         given[name] = None if given.get(name) is None else Path(given[name])
-    options = FitOptions(**{**given, "tracks": None, "side": "auto", "fov": None})
-    return replace(options, tracks=run / "tracks.json", masks=masks or options.masks)
+    tracked = given.get("tracks") is None and given.get("side") != "both"
+    options = FitOptions(**(given if tracked else {**given, "tracks": None, "side": "auto", "fov": None}))
+    tracks = None if tracked else run / "tracks.json"
+    return replace(options, tracks=tracks, masks=masks or options.masks)

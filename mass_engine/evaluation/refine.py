@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import torch
 from torch import Tensor
 
 from mass_engine.evaluation.scores import Renderable
 from mass_engine.fitting.kinematics import turned
-from mass_engine.fitting.views import Level, View
+from mass_engine.fitting.views import View
 from mass_engine.hand.pose import HandPose
 from mass_engine.threads import one_thread
 
@@ -53,22 +54,31 @@ def refine_pose(
     total = torch.zeros(_SIZE)
     with torch.no_grad(), one_thread():
         for side in o.sides:
-            problem = _Problem(subject, view.level(side), pose, sigmas, o)
+            problem = _Problem(subject, view, side, pose, sigmas, o)
             total = problem.solve(total)
-        whole = _Problem(subject, view.level(1 << 16), pose, sigmas, o)
+        whole = _Problem(subject, view, 1 << 16, pose, sigmas, o)
         if whole.squares(total) >= whole.squares(torch.zeros(_SIZE)):
             return pose
     return turned(pose, total.unsqueeze(0))
 
 
 class _Problem:
-    """One frame at one resolution."""
+    """One frame at one resolution. Renders are reduced to it, not drawn at it: there a renderer's low-pass
+    filter makes every hand fatter, and a pose that hides this is wrong at full size."""
 
     def __init__(
-        self, subject: Renderable, level: Level, pose: HandPose, sigmas: Tensor, options: RefineOptions
+        self,
+        subject: Renderable,
+        view: View,
+        side: int,
+        pose: HandPose,
+        sigmas: Tensor,
+        options: RefineOptions,
     ) -> None:
-        self.subject, self.level, self.pose = subject, level, pose
+        level, self._camera = view.level(side), view.level(1 << 16).camera
+        self.subject, self.pose = subject, pose
         self.sigmas, self.options = sigmas, options
+        self._size = level.hand.shape[1], level.hand.shape[0]
         cover = level.hand.unsqueeze(-1)
         self._target = torch.cat([level.rgb * cover, options.silhouette * cover], -1)
         self._counts = torch.cat([level.colored.unsqueeze(-1).expand(*level.hand.shape, 3),
@@ -103,8 +113,9 @@ class _Problem:
 
     def _render(self, step: Tensor) -> Tensor:
         """Colours and, as the fourth channel, the silhouette [h,w,4]."""
-        out = self.subject.render_pose(turned(self.pose, step.unsqueeze(0)), self.level.camera)
-        return torch.cat([out.rgb, self.options.silhouette * out.alpha.unsqueeze(-1)], -1)
+        out = self.subject.render_pose(turned(self.pose, step.unsqueeze(0)), self._camera)
+        picture = torch.cat([out.rgb, self.options.silhouette * out.alpha.unsqueeze(-1)], -1)
+        return torch.from_numpy(cv2.resize(picture.numpy(), self._size, interpolation=cv2.INTER_AREA))
 
     def _weights(self, residual: Tensor) -> Tensor:
         """Of a Geman-McClure-like loss; ignored pixels count nothing."""

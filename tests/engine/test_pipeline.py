@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import torch
 import trimesh
 
 from mass_engine import Avatar, BadArgumentError, EngineError
+from mass_engine.evaluation.heldout import evaluate_run
 from mass_engine.export.ply import read_ply, write_ply
 from mass_engine.rendering import render_frames, render_to_file
 from tests.engine.video.odd import PERSONAL
@@ -46,6 +48,18 @@ def test_run_directory_holds_what_is_promised(draft_run: Path) -> None:
     )
     assert len(tracks["frames"][0]["hands"][0]["hand_pose"]) == 45
     assert len(list((draft_run / "previews").iterdir())) >= 10
+
+
+def test_an_evaluation_sees_the_masks_of_the_fit(demo_clip: Path, draft_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(draft_run, run)
+    scores = evaluate_run(run, demo_clip, refine=False)
+    report = json.loads((run / "report.json").read_text())
+    found = {row["index"]: row["psnr_in_mask"] for row in scores.as_fitted}
+    assert found == pytest.approx(
+        {row["index"]: row["psnr_in_mask"] for row in report["per_frame"]}, abs=1e-3
+    )
+    assert (run / "evaluation.json").is_file()
 
 
 def test_personal_tags_reach_no_output(demo_clip: Path, draft_run: Path) -> None:

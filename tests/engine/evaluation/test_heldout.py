@@ -64,6 +64,15 @@ def test_refinement_finds_the_pose_again_and_leaves_a_right_one_alone() -> None:
     torch.testing.assert_close(nothing.hand_pose, wrong.hand_pose)
 
 
+def test_a_look_at_a_small_picture_is_not_misled_by_the_renderers_filter() -> None:
+    poses = true_poses(3)
+    view, truth, avatar = make_views(poses)[1], one(poses, 1), painted_avatar()
+    wrong = turned(truth, torch.full((1, 51), 0.004))
+    found = refine_pose(avatar, view, wrong, RefineOptions(sides=(64,)))
+    before, after = (score_view(avatar, view, pose)["psnr_hand_on_black"] for pose in (wrong, found))
+    assert after > before + 1.0
+
+
 def test_a_few_frames_have_a_second_figure() -> None:
     poses = true_poses(3)
     views, avatar = make_views(poses), painted_avatar()

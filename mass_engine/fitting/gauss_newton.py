@@ -96,9 +96,9 @@ class Registrar:
         self.camera, self.raster = camera, raster
         self.priors = priors or Priors()
         self.light, self._shading = white_light(), shading
-        #: Silhouette overlap [F] and poses [F,...] before each row's last step (overlap 0: none yet).
         #: How much brighter each frame's colours are [F,3].
         self.gains = torch.ones(len(views), 3)
+        #: Silhouette overlap [F] and poses [F,...] before each row's last step (overlap 0: none yet).
         self.memory = {"overlap": torch.zeros(len(views))}
         self.memory |= {name: value.clone() for name, value in table.values.items()}
         self.undone = 0

@@ -129,18 +129,15 @@ class PosableSurfels:
             surfels = AttachedSurfels(*(v[:, self.sources] for v in _parts(every)))
             if self.static is not None:
                 still = len(self.static.offset)
-                attached = AttachedSurfels(*(v[:, :still] for v in _parts(surfels)))
-                settled = deform_reference(attached, self.static.residuals(len(poses.refined)))
-                both = zip(_parts(settled), _parts(surfels), strict=True)
-                surfels = AttachedSurfels(*(torch.cat([new, old[:, still:]], 1) for new, old in both))
+                residuals = self.static.residuals(len(poses.refined))
+                settled = deform_reference(surfels.part(slice(still)), residuals)
+                surfels = settled.then(surfels.part(slice(still, None)))
             opacities = self.opacities.expand(len(poses.refined), -1)
             if self.deformation is not None:
                 start = self.deformed_from
                 residuals = self.deformation.residuals(poses.hand_pose, poses.betas)
-                moving = AttachedSurfels(*(v[:, start:] for v in _parts(surfels)))
-                moved = deform_reference(moving, residuals)
-                both = zip(_parts(surfels), _parts(moved), strict=True)
-                surfels = AttachedSurfels(*(torch.cat([old[:, :start], new], 1) for old, new in both))
+                moved = deform_reference(surfels.part(slice(start, None)), residuals)
+                surfels = surfels.part(slice(start)).then(moved)
                 opacities = torch.cat([opacities[:, :start], opacities[:, start:] * residuals.mask], 1)
             colors = shade(self.albedo, self.light, surfels.normals)
             if self.sh.shape[1]:

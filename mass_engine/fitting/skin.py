@@ -128,17 +128,16 @@ class Skin:
                 )
         if self.static is None and self.deformation is None:
             return PosedSurfels(surfels, refined, bone_rotations, joints)
-        attached, detached = (
-            _slice(surfels, rows) for rows in (slice(self.detached_from), slice(self.detached_from, None))
-        )
+        start = self.detached_from
+        attached, detached = surfels.part(slice(start)), surfels.part(slice(start, None))
         if self.static is not None:
             attached = self.static.apply(attached)
         if self.deformation is None:
-            return PosedSurfels(_joined(attached, detached), refined, bone_rotations, joints)
+            return PosedSurfels(attached.then(detached), refined, bone_rotations, joints)
         residuals = self.deformation(hand_pose, betas)
         moved, mask = deform(detached, residuals), residuals.mask
-        mask = torch.cat([mask.new_ones(len(mask), self.detached_from), mask], 1)
-        return PosedSurfels(_joined(attached, moved), refined, bone_rotations, joints, mask, residuals)
+        mask = torch.cat([mask.new_ones(len(mask), start), mask], 1)
+        return PosedSurfels(attached.then(moved), refined, bone_rotations, joints, mask, residuals)
 
     def triangles(self, refined: Tensor) -> Tensor:
         """The refined mesh's faces [B,D,3 corners,3] that the detached surfels come from."""
@@ -146,16 +145,3 @@ class Skin:
             torch.div(self.detached, self.binding.per_face, rounding_mode="floor")
         ]
         return refined[:, faces]
-
-
-def _parts(surfels: AttachedSurfels) -> tuple[Tensor, Tensor, Tensor]:
-    return surfels.means, surfels.tangents, surfels.normals
-
-
-def _joined(first: AttachedSurfels, last: AttachedSurfels) -> AttachedSurfels:
-    both = zip(_parts(first), _parts(last), strict=True)
-    return AttachedSurfels(*(torch.cat(pair, 1) for pair in both))
-
-
-def _slice(surfels: AttachedSurfels, rows: slice) -> AttachedSurfels:
-    return AttachedSurfels(*(part[:, rows] for part in _parts(surfels)))

@@ -34,6 +34,20 @@ class AttachedSurfels:
     tangents: Tensor
     normals: Tensor
 
+    def part(self, rows: slice) -> AttachedSurfels:
+        """Some of them."""
+        return AttachedSurfels(
+            self.means[..., rows, :], self.tangents[..., rows, :, :], self.normals[..., rows, :]
+        )
+
+    def then(self, others: AttachedSurfels) -> AttachedSurfels:
+        """These, and after them the others."""
+        return AttachedSurfels(
+            torch.cat([self.means, others.means], -2),
+            torch.cat([self.tangents, others.tangents], -3),
+            torch.cat([self.normals, others.normals], -2),
+        )
+
     def scales_quats(self) -> tuple[Tensor, Tensor]:
         """Standard deviations [...,N,2] along the principal axes and their rotation, quats [...,N,4] wxyz."""
         return principal_scales_quats(self.tangents[..., 0, :], self.tangents[..., 1, :])
